@@ -1,0 +1,143 @@
+"""Coordinate systems: the metric CRS of a parcel, the local frame {Main}, and WGS84.
+
+Heights are never moved between vertical datums: without geoid grids PROJ would leave them unchanged
+with no more than a warning, so they stay the cloud's own, and only their unit becomes the metre.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pyproj import CRS, Proj, Transformer
+from pyproj.exceptions import CRSError
+
+from vinemap.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+WGS84 = CRS.from_epsg(4326)
+SCALE_TOLERANCE = 0.01
+"""A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
+
+
+class Origin(NamedTuple):
+    """Origin of {Main}: WGS84 latitude and longitude in degrees, altitude in metres."""
+
+    lat: float
+    lon: float
+    alt: float
+
+
+def parse_crs(text: str) -> CRS:
+    """Read a CRS as a user writes it (``EPSG:32632``, ``32632``, WKT, PROJ).
+
+    Raises
+    ------
+    InputError
+        If PROJ doesn't know it.
+    """
+    try:
+        return CRS.from_user_input(int(text) if text.strip().isdigit() else text)
+    except CRSError as error:
+        raise InputError(f"unknown CRS {text!r}: give it as EPSG:n, for example EPSG:32632") from error
+
+
+def horizontal(crs: CRS) -> CRS:
+    """Return the two-dimensional part of a CRS, which is all that GeoPackage and GeoTIFF keep well."""
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    return flat.to_2d()
+
+
+def vertical_name(crs: CRS) -> str | None:
+    """Name of the vertical datum that a CRS states, or None."""
+    return crs.sub_crs_list[1].name if crs.is_compound else None
+
+
+def vertical_unit(crs: CRS) -> float:
+    """Metres in one unit of height.
+
+    A CRS without heights of its own is taken to measure them in its horizontal unit (state-plane feet),
+    and in metres where that unit is an angle.
+    """
+    if crs.is_compound:
+        return float(crs.sub_crs_list[1].axis_info[0].unit_conversion_factor)
+    if len(crs.axis_info) > 2:
+        return float(crs.axis_info[2].unit_conversion_factor)
+    return 1.0 if crs.is_geographic else float(crs.axis_info[0].unit_conversion_factor)
+
+
+def metric_crs(crs: CRS, x: float, y: float) -> CRS:
+    """Choose the projected CRS in metres in which a cloud around (x, y) is worked.
+
+    The cloud's own horizontal CRS where it is projected, metric and true to scale there; else the UTM
+    zone of the point.
+
+    Parameters
+    ----------
+    crs : CRS
+        CRS of the coordinates.
+    x, y : float
+        A point of the cloud, in ``crs``, x east.
+    """
+    flat = horizontal(crs)
+    lon, lat = transformer(flat, WGS84).transform(x, y)
+    if not (np.isfinite(lon) and np.isfinite(lat)):
+        raise InputError(f"coordinates ({x:.1f}, {y:.1f}) don't lie in {flat.name}: give the right one with --crs")
+    if flat.is_projected and flat.axis_info[0].unit_conversion_factor == 1.0:
+        factors = Proj(flat).get_factors(lon, lat)
+        if max(abs(factors.meridional_scale - 1), abs(factors.parallel_scale - 1)) < SCALE_TOLERANCE:
+            return flat
+    zone = int((lon + 180) // 6) % 60 + 1
+    return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+@lru_cache(maxsize=32)
+def transformer(source: CRS, target: CRS) -> Transformer:
+    """Transformer between horizontal CRSs, x east and y north on both sides."""
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
+@lru_cache(maxsize=32)
+def _topocentric(origin: Origin) -> Transformer:
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={origin.lat!r} +lon_0={origin.lon!r} +h_0={origin.alt!r}"
+    )
+
+
+def to_wgs84(xyz: ArrayLike, crs: CRS) -> NDArray[np.float64]:
+    """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in a projected CRS."""
+    points = np.atleast_2d(np.asarray(xyz, dtype=float))
+    lon, lat = transformer(crs, WGS84).transform(points[:, 0], points[:, 1])
+    return np.column_stack([lat, lon, points[:, 2]])
+
+
+def from_wgs84(lat_lon_alt: ArrayLike, crs: CRS) -> NDArray[np.float64]:
+    """Points (n, 3) in a projected CRS from latitude, longitude (degrees) and altitude (m)."""
+    points = np.atleast_2d(np.asarray(lat_lon_alt, dtype=float))
+    x, y = transformer(WGS84, crs).transform(points[:, 1], points[:, 0])
+    return np.column_stack([x, y, points[:, 2]])
+
+
+def wgs84_to_main(lat_lon_alt: ArrayLike, origin: Origin) -> NDArray[np.float64]:
+    """Points (n, 3) in {Main}: the topocentric frame (east, north, up) at ``origin``, in metres.
+
+    Table 2.1's two halves agree in this frame to 3 mm.
+    """
+    points = np.atleast_2d(np.asarray(lat_lon_alt, dtype=float))
+    return np.column_stack(_topocentric(origin).transform(points[:, 1], points[:, 0], points[:, 2]))
+
+
+def main_to_wgs84(xyz: ArrayLike, origin: Origin) -> NDArray[np.float64]:
+    """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in {Main}."""
+    points = np.atleast_2d(np.asarray(xyz, dtype=float))
+    lon, lat, alt = _topocentric(origin).transform(*points.T, direction="INVERSE")
+    return np.column_stack([lat, lon, alt])
+
+
+def to_main(xyz: ArrayLike, crs: CRS, origin: Origin) -> NDArray[np.float64]:
+    """Points (n, 3) of a projected CRS in {Main}."""
+    return wgs84_to_main(to_wgs84(xyz, crs), origin)
