@@ -134,7 +134,8 @@ def wgs84_to_main(lat_lon_alt: ArrayLike, origin: Origin) -> NDArray[np.float64]
 def main_to_wgs84(xyz: ArrayLike, origin: Origin) -> NDArray[np.float64]:
     """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in {Main}."""
     points = np.atleast_2d(np.asarray(xyz, dtype=float))
-    lon, lat, alt = _topocentric(origin).transform(*points.T, direction="INVERSE")
+    x, y, z = points.T
+    lon, lat, alt = _topocentric(origin).transform(x, y, z, direction="INVERSE")
     return np.column_stack([lat, lon, alt])
 
 
