@@ -1,0 +1,174 @@
+"""Terrain from the cloud: a DTM on a raster of robust low percentiles, and heights above it.
+
+A cell tells its terrain by a low order statistic of the heights in it, corrected for the statistic's expected
+depth below the mean of the noise. Local planes are fitted to the cells, from coarse to fine; cells that stand
+above them (canopy, trees, houses) lose their weight, so that under a closed canopy the surface is carried on
+from around. On terraces a patch may stand above the fit if its points lie in one thin layer, as soil does.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import binary_opening, correlate1d
+from scipy.special import ndtri
+
+from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vinemap.cloud import PointCloud
+
+    Values = NDArray[np.float64]
+
+COARSE = 1.0
+"""Cell size in metres of the first, coarse surface."""
+STEP = 0.001
+"""Heights are sorted in steps of a millimetre."""
+RIDGE = 0.02
+"""Weight that holds a local plane to the coarser surface where cells are few."""
+
+
+class _Cells(NamedTuple):
+    """Order statistics of the heights in each cell (ny, nx): counts, and quantiles where there are points."""
+
+    n: Values
+    low: Values
+    middle: Values
+    high: Values
+
+
+def terrain_model(
+    cloud: PointCloud,
+    *,
+    resolution: float = 0.25,
+    quantile: float = 0.1,
+    tolerance: float = 0.12,
+    terrace_height: float = 1.0,
+) -> Raster:
+    """Digital terrain model of a cloud, without holes.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points of terrain, vegetation and whatever stands on it; no classes needed.
+    resolution : float
+        Cell size in metres.
+    quantile : float
+        Order of the height that stands for a cell's terrain, 0 to 0.5.
+    tolerance : float
+        Metres that a cell may stand above the surface around it and still count as terrain.
+    terrace_height : float
+        Metres up to which a raised thin layer counts as a terrace; 0 where there are none.
+
+    Returns
+    -------
+    Raster
+        Elevations in metres (ny, nx).
+    """
+    xyz, crs = cloud.xyz, cloud.crs
+    grid = grid_over(xyz, resolution=resolution)
+    wide = coarser(grid, resolution=COARSE)
+    base = Raster(_coarse_surface(xyz, wide), wide, crs)
+
+    cells = _order_statistics(xyz[:, 2] - sample(base, xyz), cell_of(xyz, grid), grid, quantile)
+    noise = _noise(cells, quantile)
+    level = cells.low - noise * _depth(cells.n, quantile)
+    spread = cells.high - cells.low
+    weight = np.where(cells.n > 0, np.minimum(cells.n, 15.0) / (1 + (spread / (8 * noise)) ** 2), 0.0)
+    thin = binary_opening((cells.n > 3) & (spread < 8 * noise), np.ones((3, 3)))
+
+    surface = np.zeros(grid.shape)
+    for reach, slack in ((1.5, 4.0), (1.5, 2.5), (1.0, 1.5), (0.6, 1.0), (0.6, 1.0)):
+        above = level - surface
+        terrain = above < slack * tolerance
+        terrain |= thin & (above < terrace_height)
+        terrain &= above > -3 * slack * tolerance
+        surface = _multiscale(level, weight * terrain, reach / resolution)
+    surface = _multiscale(level, weight * terrain, 0.3 / resolution)
+    x, y = grid.centres()
+    values = surface + sample(base, np.stack(np.meshgrid(x, y), axis=-1))
+    return Raster(values, grid, crs)
+
+
+def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
+    """Height in metres (n,) of every point above the terrain model."""
+    return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
+
+
+def _coarse_surface(xyz: Values, grid: Grid) -> Values:
+    """Smooth surface (ny, nx) through the low parts of a cloud, blind to what stands on it or floats below."""
+    reference = float(np.median(xyz[:, 2]))
+    cells = _order_statistics(xyz[:, 2] - reference, cell_of(xyz, grid), grid, 0.05)
+    weight = (cells.n > 0).astype(float)
+    surface = np.zeros(grid.shape)
+    for sigma in (8.0, 8.0, 5.0, 5.0, 5.0, 4.0, 4.0, 4.0):
+        surface = _multiscale(cells.low, weight, sigma / COARSE)
+        above = np.where(cells.n > 0, cells.low - surface, 0.0)
+        scale = 0.1 + 1.5 * float(np.median(np.abs(above[cells.n > 0])))
+        asymmetric = np.where(above > 0, above / scale, above / (5 * scale))
+        weight = np.where(cells.n > 0, 1 / (1 + asymmetric**2) ** 2, 0.0)
+    return surface + reference
+
+
+def _order_statistics(heights: Values, cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
+    """Quantiles of heights in cells: one sort of integers that hold the cell above and the height below."""
+    lowest = -500.0
+    steps = np.clip((heights - lowest) / STEP, 0, 2**20 - 1).astype(np.int64)
+    keys = np.sort((cells << 20) | steps)
+    ordered = (keys & (2**20 - 1)) * STEP + lowest
+    n = np.bincount(cells, minlength=grid.ny * grid.nx)
+    first = np.concatenate([[0], np.cumsum(n)[:-1]])
+
+    def at(q: float) -> Values:
+        rank = np.ceil(q * n).astype(np.int64) - 1
+        index = np.minimum(first + np.maximum(rank, 0), len(ordered) - 1)
+        return np.where(n > 0, ordered[index], 0.0).reshape(grid.shape)
+
+    return _Cells(n.reshape(grid.shape).astype(float), at(quantile), at(0.5), at(0.9))
+
+
+def _depth(n: Values, quantile: float) -> Values:
+    """Expected order statistic of n standard normal heights (Blom 1958)."""
+    rank = np.maximum(np.ceil(quantile * n), 1)
+    out: Values = ndtri((rank - 0.375) / (np.maximum(n, 1) + 0.25))
+    return out
+
+
+def _noise(cells: _Cells, quantile: float) -> float:
+    """Standard deviation in metres of the heights of bare soil: that of the cells with the thinnest layers."""
+    dense = cells.n >= max(5.0, float(np.quantile(cells.n[cells.n > 0], 0.5)))
+    half = (cells.middle - cells.low)[dense] / -_depth(cells.n[dense], quantile)
+    return float(np.clip(np.quantile(half, 0.25), 0.005, 0.1)) if half.size else 0.03
+
+
+def _multiscale(level: Values, weight: Values, sigma: float) -> Values:
+    """Local planes of width sigma (cells), held to ever wider ones where cells lack."""
+    surface = np.zeros_like(level)
+    for scale in (9.0, 3.0, 1.0):
+        surface = surface + _plane_fit(level - surface, weight, sigma * scale)
+    return surface
+
+
+def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
+    """Value at each cell of the weighted local plane through levels (ny, nx): first-order local regression."""
+    radius = int(np.ceil(2.5 * sigma))
+    t = np.arange(-radius, radius + 1) / sigma
+    bell = np.exp(-0.5 * t**2)
+    bell /= bell.sum()
+    kernels = bell, bell * t, bell * t**2
+
+    def moment(values: Values, a: int, b: int) -> Values:
+        out: Values = correlate1d(correlate1d(values, kernels[a], axis=0, mode="constant"), kernels[b], axis=1, mode="constant")
+        return out
+
+    w, wi, wj = moment(weight, 0, 0), moment(weight, 1, 0), moment(weight, 0, 1)
+    wii, wij, wjj = moment(weight, 2, 0), moment(weight, 1, 1), moment(weight, 0, 2)
+    values = weight * level
+    z, zi, zj = moment(values, 0, 0), moment(values, 1, 0), moment(values, 0, 1)
+    w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
+    # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
+    a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj
+    return (a * z + b * zi + c * zj) / (a * w + b * wi + c * wj)

@@ -1,0 +1,116 @@
+"""Key points: canopy centres found across the rows at the nodes of a 0.5 m grid (thesis, section 2.3.1)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import geopandas as gpd
+import numpy as np
+
+from vinemap.raster import Grid, Raster, sample
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vinemap.row_field import RowField
+
+    Values = NDArray[np.float64]
+
+BATCH = 20_000
+
+
+def detect_key_points(
+    cover: Raster,
+    dtm: Raster,
+    field: RowField,
+    *,
+    grid_step: float = 0.5,
+    reach: float = 0.6,
+    slice_width: float = 0.5,
+    bin_width: float = 0.05,
+    min_cover: float = 0.12,
+    min_likelihood: float = 0.1,
+) -> gpd.GeoDataFrame:
+    """Find the canopy's central points (Eq. 1–3).
+
+    At every node O of a grid, canopy cover in a slice across the local rows makes a profile D(v) (Eq. 1, of cover
+    instead of point counts, so that it doesn't follow the cloud's density); its maxima v̂ are the central points
+    c = O + v̂·(−sin ϑ, cos ϑ) (Eq. 2–3), with ϑ the direction of the rows.
+
+    Parameters
+    ----------
+    cover : Raster
+        Canopy cover 0–1.
+    dtm : Raster
+        Terrain, for the points' elevation.
+    field : RowField
+        Direction and spacing of the rows.
+    grid_step, slice_width, bin_width : float
+        Distance of the nodes, width of the slice along the rows and of the profile's bins, in metres.
+    reach : float
+        How far a profile reaches to both sides, in inter-row spacings. The thesis's cylinders of 5 m reach 2.
+    min_cover, min_likelihood : float
+        Cover that a maximum must have, and likelihood that a node must have.
+
+    Returns
+    -------
+    GeoDataFrame
+        PointZ with columns ``cover`` (0–1), ``direction_deg`` and ``spacing_m`` of the field there.
+    """
+    nodes = _nodes(field, cover.grid, grid_step, min_likelihood)
+    found = [np.empty((0, 5))]
+    for start in range(0, len(nodes), BATCH):
+        found.append(_peaks(cover, nodes[start : start + BATCH], reach, slice_width, bin_width, min_cover))
+    points = np.concatenate(found)
+    z = sample(dtm, points[:, :2]) if len(points) else np.empty(0)
+    return gpd.GeoDataFrame(
+        {"cover": points[:, 2], "direction_deg": points[:, 3], "spacing_m": points[:, 4]},
+        geometry=gpd.points_from_xy(points[:, 0], points[:, 1], z),
+        crs=cover.crs,
+    )
+
+
+def central_points(origin: Values, offsets: Values, direction: Values) -> Values:
+    """Points (n, 2) at offsets (n,) in metres to the left of rows of a direction in radians (n,), from origins (n, 2).
+
+    Eq. 2–3, with ϑ the direction of the row.
+    """
+    return origin + offsets[:, None] * np.column_stack([-np.sin(direction), np.cos(direction)])
+
+
+def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> Values:
+    """Nodes (n, 4) as x, y, direction (rad), spacing (m), where rows are likely."""
+    x = np.arange(grid.west + step / 2, grid.west + grid.nx * grid.resolution, step)
+    y = np.arange(grid.north - step / 2, grid.north - grid.ny * grid.resolution, -step)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    cells = field.direction.grid
+    i = np.clip(((cells.north - xy[:, 1]) / cells.resolution).astype(int), 0, cells.ny - 1)
+    j = np.clip(((xy[:, 0] - cells.west) / cells.resolution).astype(int), 0, cells.nx - 1)
+    direction, spacing = field.direction.values[i, j], field.spacing.values[i, j]
+    likely = (field.likelihood.values[i, j] >= min_likelihood) & np.isfinite(direction) & np.isfinite(spacing)
+    return np.column_stack([xy, np.radians(direction), spacing])[likely]
+
+
+def _peaks(
+    cover: Raster, nodes: Values, reach: float, slice_width: float, bin_width: float, min_cover: float
+) -> Values:
+    """Maxima (m, 5) of the profiles at nodes (n, 4): x, y, cover, direction (degrees), spacing (m)."""
+    origin, direction, spacing = nodes[:, :2], nodes[:, 2], nodes[:, 3]
+    half = int(np.ceil(reach * spacing.max() / bin_width))
+    offsets = np.arange(-half, half + 1) * bin_width
+    along = np.linspace(-slice_width / 2, slice_width / 2, 5)
+    tangent = np.column_stack([np.cos(direction), np.sin(direction)])
+    normal = np.column_stack([-np.sin(direction), np.cos(direction)])
+    profile = np.zeros((len(nodes), len(offsets)))
+    for t in along:
+        profile += sample(cover, (origin + t * tangent)[:, None] + offsets[:, None] * normal[:, None])
+    profile /= len(along)
+    middle = profile[:, 1:-1]
+    peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
+    peak &= np.abs(offsets[1:-1]) <= reach * spacing[:, None]
+    row, column = np.nonzero(peak)
+    left, top, right = profile[row, column], profile[row, column + 1], profile[row, column + 2]
+    shift = 0.5 * (left - right) / np.minimum(left - 2 * top + right, -1e-9)
+    v = offsets[column + 1] + bin_width * np.clip(shift, -0.5, 0.5)
+    xy = central_points(origin[row], v, direction[row])
+    return np.column_stack([xy, top, np.degrees(direction[row]), spacing[row]])

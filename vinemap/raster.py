@@ -1,0 +1,136 @@
+"""North-up rasters: binning points into cells, sampling, and Cloud Optimized GeoTIFF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from affine import Affine
+from scipy.ndimage import map_coordinates
+
+from vinemap.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike, NDArray
+    from pyproj import CRS
+
+MAX_CELLS = 400_000_000
+NODATA = -9999.0
+
+
+class Grid(NamedTuple):
+    """Square cells of a north-up raster: row ``i`` counts from the north, column ``j`` from the west.
+
+    ``west`` and ``north`` are the outer corner in metres of the CRS, ``resolution`` the cell size in metres.
+    """
+
+    west: float
+    north: float
+    resolution: float
+    ny: int
+    nx: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of cells (ny, nx)."""
+        return self.ny, self.nx
+
+    def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coordinates of cell centres: x (nx,) eastwards and y (ny,) southwards."""
+        x = self.west + (np.arange(self.nx) + 0.5) * self.resolution
+        y = self.north - (np.arange(self.ny) + 0.5) * self.resolution
+        return x, y
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Values (ny, nx) on a grid; NaN is nodata."""
+
+    values: NDArray[np.floating]
+    grid: Grid
+    crs: CRS
+
+
+def grid_over(xy: ArrayLike, *, resolution: float) -> Grid:
+    """Smallest grid over points (n, ≥2), its edges at multiples of the cell size.
+
+    Raises
+    ------
+    InputError
+        If it would have more than ``MAX_CELLS`` cells.
+    """
+    points = np.asarray(xy)
+    west, south = np.floor(points[:, :2].min(axis=0) / resolution) * resolution
+    east, north = points[:, :2].max(axis=0)
+    nx = int((east - west) // resolution) + 1
+    ny = int(np.ceil((north - south) / resolution)) + 1
+    if nx * ny > MAX_CELLS:
+        raise InputError(
+            f"the cloud spans {east - west:.0f} m by {north - south:.0f} m, too much for one parcel at "
+            f"{resolution} m: clip it with --boundary"
+        )
+    return Grid(float(west), float(south + ny * resolution), resolution, ny, nx)
+
+
+def coarser(grid: Grid, *, resolution: float) -> Grid:
+    """Grid of another cell size that covers the same area from the same corner."""
+    ny, nx = (int(np.ceil(n * grid.resolution / resolution - 1e-9)) for n in grid.shape)
+    return Grid(grid.west, grid.north, resolution, ny, nx)
+
+
+def cell_of(xy: NDArray[np.float64], grid: Grid) -> NDArray[np.int64]:
+    """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
+    j = ((xy[:, 0] - grid.west) / grid.resolution).astype(np.int64)
+    i = ((grid.north - xy[:, 1]) / grid.resolution).astype(np.int64)
+    np.clip(j, 0, grid.nx - 1, out=j)
+    np.clip(i, 0, grid.ny - 1, out=i)
+    i *= grid.nx
+    i += j
+    return i
+
+
+def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
+    """Points in each cell, (ny, nx)."""
+    return np.bincount(cells, minlength=grid.ny * grid.nx).reshape(grid.shape).astype(float)
+
+
+def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
+    """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
+    points = np.asarray(xy, dtype=float)
+    grid = raster.grid
+    j = (points[..., 0] - grid.west) / grid.resolution - 0.5
+    i = (grid.north - points[..., 1]) / grid.resolution - 0.5
+    out: NDArray[np.float64] = map_coordinates(
+        raster.values, [i.ravel(), j.ravel()], order=1, mode="nearest", output=np.float64
+    ).reshape(i.shape)
+    return out
+
+
+def write_cog(raster: Raster, path: Path, *, description: str, unit: str) -> None:
+    """Write a float32 Cloud Optimized GeoTIFF with nodata, overviews, description and unit of its band."""
+    import rasterio  # noqa: PLC0415  (half a second of start-up, needed only here)
+    from rasterio.io import MemoryFile  # noqa: PLC0415
+    from rasterio.shutil import copy  # noqa: PLC0415
+
+    grid = raster.grid
+    values = np.where(np.isfinite(raster.values), raster.values, NODATA).astype(np.float32)
+    profile = {
+        "driver": "GTiff",
+        "dtype": "float32",
+        "count": 1,
+        "height": grid.ny,
+        "width": grid.nx,
+        "nodata": NODATA,
+        "crs": raster.crs.to_wkt(),
+        "transform": Affine(grid.resolution, 0, grid.west, 0, -grid.resolution, grid.north),
+    }
+    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile() as memory:
+        with memory.open(**profile) as target:
+            target.write(values, 1)
+            target.set_band_description(1, description)
+            target.set_band_unit(1, unit)
+            target.update_tags(AREA_OR_POINT="Area")
+        copy(memory.name, path, driver="COG", compress="DEFLATE", predictor="YES", overview_resampling="average")

@@ -1,0 +1,260 @@
+"""Row direction, inter-row spacing and vineyard likelihood, from the spectrum of the canopy's cover.
+
+Rows are a plane wave in a raster of canopy cover: in a window of a few rows the strongest peak of its power
+spectrum lies across the rows at one cycle a spacing (Delenne et al. 2008; the thesis scans cylinders instead).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.fft import rfft2
+from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, map_coordinates, maximum_filter
+
+from vinemap.raster import Grid, Raster, cell_of, coarser, count, grid_over
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vinemap.cloud import PointCloud
+
+    Values = NDArray[np.float64]
+
+FIELD_RESOLUTION = 1.0
+"""Cell size in metres of the rasters of a row field."""
+COVER_RESOLUTION = 0.25
+"""Cell size in metres of the cover whose spectrum is taken."""
+PADDING = 2
+"""Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
+BATCH = 512
+
+
+@dataclass(frozen=True)
+class RowField:
+    """Rasters of direction (degrees anticlockwise from east, axial in [0, 180)), spacing (m), likelihood (0–1)."""
+
+    direction: Raster
+    spacing: Raster
+    likelihood: Raster
+
+
+class _Peaks(NamedTuple):
+    """Wave of each window (my, mx): direction of the rows in radians, spacing in metres, strength 0–1."""
+
+    direction: Values
+    spacing: Values
+    strength: Values
+
+
+def canopy_cover(
+    cloud: PointCloud,
+    heights: Values,
+    *,
+    resolution: float = 0.1,
+    low: float = 0.5,
+    high: float = 2.9,
+    smoothing: float | None = None,
+) -> Raster:
+    """Share of a cell's points that are canopy: between two heights above ground, and under nothing taller.
+
+    A ratio, so that neither the cloud's density nor its unevenness between flight lines matters.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        The parcel's points.
+    heights : (n,) array
+        Their heights above ground in metres.
+    resolution : float
+        Cell size in metres.
+    smoothing : float, optional
+        Standard deviation in metres of the Gaussian that smooths both counts; by default the cloud's mean distance
+        between points, and half a cell at the least.
+    low, high : float
+        Heights in metres between which points count as canopy. What stands higher over at least a square metre
+        (trees, houses) is left out.
+    """
+    grid = grid_over(cloud.xyz, resolution=resolution)
+    cells = cell_of(cloud.xyz, grid)
+    everything = count(cells, grid)
+    canopy = count(cells[(heights >= low) & (heights <= high)], grid)
+    density = len(cells) / max(1, np.count_nonzero(everything))
+    sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
+    blurred = gaussian_filter(everything, sigma)
+    cover = gaussian_filter(canopy, sigma) / (blurred + 0.1 * density)
+    cover[_tall(cloud, heights, high, grid)] = 0.0
+    return Raster(cover, grid, cloud.crs)
+
+
+def _tall(cloud: PointCloud, heights: Values, high: float, grid: Grid) -> NDArray[np.bool_]:
+    """Cells (ny, nx) of objects taller than vines, with half a metre around them."""
+    wide = coarser(grid, resolution=0.5)
+    cells = cell_of(cloud.xyz, wide)
+    above = count(cells[(heights > high) & (heights < 40)], wide)
+    tall = binary_opening(above > np.maximum(3, 0.15 * count(cells, wide)), np.ones((2, 2)))
+    tall = binary_dilation(tall, np.ones((3, 3)))
+    i, j = (np.minimum((np.arange(n) + 0.5) * grid.resolution / 0.5, m - 1).astype(int)
+            for n, m in zip(grid.shape, wide.shape, strict=True))
+    out: NDArray[np.bool_] = tall[np.ix_(i, j)]
+    return out
+
+
+def estimate_row_field(
+    cover: Raster,
+    *,
+    window: float = 16.0,
+    step: float = 2.0,
+    min_spacing: float = 1.2,
+    max_spacing: float = 4.5,
+) -> RowField:
+    """Estimate the row field from canopy cover.
+
+    Parameters
+    ----------
+    cover : Raster
+        Canopy cover 0–1.
+    window, step : float
+        Width of the square windows and their distance, in metres.
+    min_spacing, max_spacing : float
+        Band of inter-row spacings in metres in which the peak is sought.
+
+    Returns
+    -------
+    RowField
+        On a grid of 1 m over the cover's area. Likelihood is the share of the window's variance that the wave
+        carries; direction and spacing are NaN where it is zero.
+    """
+    base = _block_mean(cover, COVER_RESOLUTION)
+    peaks = _scan(base.values, window, step, (min_spacing, max_spacing))
+    peaks = _axial_median(peaks)
+    grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
+    return _resample(peaks, grid, base.grid, window, step, cover)
+
+
+def _block_mean(raster: Raster, resolution: float) -> Raster:
+    grid = coarser(raster.grid, resolution=resolution)
+    x, y = raster.grid.centres()
+    jj, ii = np.meshgrid(
+        np.minimum(((x - grid.west) / resolution).astype(int), grid.nx - 1),
+        np.minimum(((grid.north - y) / resolution).astype(int), grid.ny - 1),
+    )
+    flat = (ii * grid.nx + jj).ravel()
+    total = np.bincount(flat, weights=raster.values.ravel(), minlength=grid.ny * grid.nx)
+    n = np.bincount(flat, minlength=grid.ny * grid.nx)
+    return Raster((total / np.maximum(n, 1)).reshape(grid.shape), grid, raster.crs)
+
+
+def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
+    """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
+    size = int(round(window / COVER_RESOLUTION / 2)) * 2
+    stride = int(round(step / COVER_RESOLUTION))
+    # Windows reach over the edge by half their width; what lies there is no canopy.
+    my, mx = (n // stride + 2 for n in cover.shape)
+    padded = np.zeros([(m - 1) * stride + size for m in (my, mx)])
+    half = size // 2
+    padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover
+    windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
+    hann = np.hanning(size + 1)[:-1]
+    taper = hann[:, None] * hann
+    occupied = np.flatnonzero([w.any() for w in windows])
+    out = np.zeros((3, len(windows)))
+    out[:2] = np.nan
+    for start in range(0, len(occupied), BATCH):
+        batch = occupied[start : start + BATCH]
+        out[:, batch] = _strongest_wave(windows[batch], taper, band)
+    return _Peaks(*out.reshape(3, my, mx))
+
+
+def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
+    """Direction (rad), spacing (m) and strength (0–1) of windows (k, size, size), as (3, k)."""
+    size = windows.shape[-1]
+    wide = PADDING * size
+    mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
+    spectrum = rfft2((windows - mean[:, None, None]) * taper, s=(wide, wide), axes=(1, 2), workers=2)
+    power = np.roll(np.abs(spectrum) ** 2, wide // 2, axis=1)
+    fy = (np.arange(wide) - wide // 2)[:, None] / (wide * COVER_RESOLUTION)
+    fx = np.arange(wide // 2 + 1)[None, :] / (wide * COVER_RESOLUTION)
+    frequency = np.hypot(fy, fx)
+    inside = (frequency >= 1 / band[1]) & (frequency <= 1 / band[0])
+    variance = power[:, frequency >= 1 / (1.5 * band[1])].sum(axis=1)
+    flat = np.where(inside, power, 0.0).reshape(len(power), -1)
+    best = flat.argmax(axis=1)
+    i, j = np.unravel_index(best, frequency.shape)
+    # The half spectrum has no columns left of fx = 0, so a peak on that edge is refined along fy alone.
+    i = np.clip(i, 1, wide - 2)
+    k = np.arange(len(power))
+    log = np.log(power + 1e-12)
+    di = _vertex(log[k, i - 1, j], log[k, i, j], log[k, i + 1, j])
+    left = np.where(j > 0, log[k, i, np.maximum(j - 1, 0)], log[k, wide - i, 1])
+    dj = _vertex(left, log[k, i, j], log[k, i, np.minimum(j + 1, wide // 2)])
+    unit = wide * COVER_RESOLUTION
+    y, x = (i + di - wide // 2) / unit, (j + dj) / unit
+    lobe = np.zeros(len(power))
+    reach = 2 * PADDING
+    for a in range(-reach, reach + 1):
+        for b in range(-reach, reach + 1):
+            column = j + b
+            row = np.where(column < 0, wide - (i + a), i + a)
+            column = np.abs(column)
+            valid = (row >= 0) & (row < wide) & (column <= wide // 2)
+            lobe += np.where(valid, power[k, np.clip(row, 0, wide - 1), np.clip(column, 0, wide // 2)], 0.0)
+    strength = np.clip(lobe / np.maximum(variance, 1e-12), 0, 1)
+    # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
+    direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
+    return np.stack([direction, 1 / np.hypot(x, y), strength])
+
+
+def _vertex(left: Values, middle: Values, right: Values) -> Values:
+    """Offset in (-0.5, 0.5) of the vertex of the parabola through three neighbours."""
+    bend = left - 2 * middle + right
+    out: Values = np.clip(0.5 * (left - right) / np.where(np.abs(bend) < 1e-9, -1e9, bend), -0.5, 0.5)
+    return out
+
+
+def _axial_median(peaks: _Peaks) -> _Peaks:
+    """Replace each window's wave by the one of its 3 x 3 neighbours that differs least from all of them."""
+    my, mx = peaks.direction.shape
+    wave = np.where(np.isfinite(peaks.direction), np.exp(2j * np.nan_to_num(peaks.direction)), 0)
+    shifts = [(a, b) for a in (0, 1, 2) for b in (0, 1, 2)]
+    padded = [np.pad(v, 1) for v in (wave, np.nan_to_num(peaks.spacing), peaks.strength)]
+    waves, spacings, weights = (np.stack([p[a : a + my, b : b + mx] for a, b in shifts]) for p in padded)
+    cost = np.zeros_like(weights)
+    for n in range(len(shifts)):
+        turn = np.abs(waves - waves[n])
+        stretch = np.abs(np.log(np.maximum(spacings, 0.1) / np.maximum(spacings[n], 0.1)))
+        cost[n] = (weights * (turn + stretch)).sum(axis=0)
+    cost[weights == 0] = np.inf
+    best = cost.argmin(axis=0)[None]
+    direction = np.mod(np.angle(np.take_along_axis(waves, best, 0)[0]) / 2, np.pi)
+    spacing = np.take_along_axis(spacings, best, 0)[0]
+    empty = peaks.strength == 0
+    return _Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
+
+
+def _resample(peaks: _Peaks, grid: Grid, base: Grid, window: float, step: float, cover: Raster) -> RowField:
+    """Bring the waves of the windows to a raster, weighted by their strength."""
+    x, y = grid.centres()
+    i, j = np.meshgrid((base.north - y) / step, (x - base.west) / step, indexing="ij")
+
+    def at(values: Values) -> Values:
+        out: Values = map_coordinates(values, [i, j], order=1, mode="nearest")
+        return out
+
+    strength = peaks.strength
+    wave = strength**2 * np.exp(2j * np.nan_to_num(peaks.direction))
+    direction = np.mod(np.degrees(np.angle(at(wave.real) + 1j * at(wave.imag)) / 2), 180)
+    weight = at(strength**2)
+    spacing = at(strength**2 * np.nan_to_num(peaks.spacing)) / np.maximum(weight, 1e-12)
+    near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, size=5) > 0.02
+    likelihood = np.where(near, at(strength), 0.0)
+    known = weight > 1e-9
+
+    def raster(values: Values) -> Raster:
+        return Raster(values, grid, cover.crs)
+
+    return RowField(
+        raster(np.where(known, direction, np.nan)), raster(np.where(known, spacing, np.nan)), raster(likelihood)
+    )

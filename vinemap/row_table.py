@@ -1,0 +1,192 @@
+"""Table 2.1: rows numbered across the rows, each with its length, orientation, elevation and two end points."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from vinemap.crs import WGS84, to_main, to_wgs84
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vinemap.crs import Origin
+
+    Values = NDArray[np.float64]
+
+SAME_BLOCK_DEG = 20.0
+"""Degrees by which neighbouring rows of one block may differ."""
+SAME_BLOCK_SPACINGS = 1.6
+"""Spacings within which rows are neighbours."""
+
+
+def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Give rows their direction and number, and gaps the number of their row.
+
+    A curve starts at its western end e1 (its southern one where it runs due north). Rows are numbered from 1 across
+    the rows, from south to north, from west to east where they run north–south; rows of one block (neighbours of
+    about one direction) follow each other, blocks from west to east.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineStringZ with ``cluster`` and ``spacing_m``.
+    gaps : GeoDataFrame
+        LineStringZ with ``cluster``, ``start_m``, ``end_m`` and ``length_m``.
+
+    Returns
+    -------
+    rows, gaps : GeoDataFrame
+        In order of ``row_id``, without ``cluster``.
+    """
+    if len(rows) == 0:
+        return (frame.drop(columns="cluster").assign(row_id=np.empty(0, dtype=np.int64)) for frame in (rows, gaps))
+    chords = [_chord(line) for line in rows.geometry]
+    backwards = np.array([c[0] < 0 or (c[0] == 0 and c[1] < 0) for c in chords])
+    lines = [shapely.reverse(g) if b else g for g, b in zip(rows.geometry, backwards, strict=True)]
+    rows = rows.set_geometry(gpd.GeoSeries(lines, index=rows.index, crs=rows.crs))
+    rank = np.empty(len(rows), dtype=np.int64)
+    rank[_order_across(rows)] = np.arange(1, len(rows) + 1)
+
+    index = pd.Index(rows["cluster"]).get_indexer(gaps["cluster"])
+    turned = backwards[index]
+    length = shapely.length(shapely.force_2d(rows.geometry.to_numpy()))[index]
+    start = np.where(turned, length - gaps["end_m"], gaps["start_m"])
+    end = np.where(turned, length - gaps["start_m"], gaps["end_m"])
+    pieces = [shapely.reverse(g) if t else g for g, t in zip(gaps.geometry, turned, strict=True)]
+    gaps = gaps.assign(row_id=rank[index], start_m=start, end_m=end)
+    gaps = gaps.set_geometry(gpd.GeoSeries(pieces, index=gaps.index, crs=rows.crs))
+    return (
+        rows.assign(row_id=rank).drop(columns="cluster").sort_values("row_id", ignore_index=True),
+        gaps.drop(columns="cluster").sort_values(["row_id", "start_m"], ignore_index=True),
+    )
+
+
+def _chord(line: shapely.LineString) -> Values:
+    ends = shapely.get_coordinates(line)[[0, -1]]
+    out: Values = ends[1] - ends[0]
+    return out
+
+
+def _order_across(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
+    """Positions of rows in the order of their numbers."""
+    lines = rows.geometry.to_numpy()
+    middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
+    angle = np.array([np.arctan2(*_chord(line)[::-1]) for line in lines])
+    block = _blocks(rows, angle)
+    across = np.empty(len(rows))
+    west = np.empty(len(rows))
+    for b in np.unique(block):
+        members = block == b
+        half = np.angle(np.exp(2j * angle[members]).mean()) / 2
+        normal = np.array([-np.sin(half), np.cos(half)])
+        # North where rows run west–east, east where they run north–south.
+        normal = normal if (normal[1] > 0.05 or (abs(normal[1]) <= 0.05 and normal[0] > 0)) else -normal
+        across[members] = middle[members] @ normal
+        west[members] = middle[members, 0].mean()
+    order: NDArray[np.int64] = np.lexsort((across, west))
+    return order
+
+
+def _blocks(rows: gpd.GeoDataFrame, angle: Values) -> NDArray[np.int32]:
+    lines = rows.geometry.to_numpy()
+    reach = SAME_BLOCK_SPACINGS * rows["spacing_m"].to_numpy()
+    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=reach)
+    turn = np.abs(np.angle(np.exp(2j * (angle[i] - angle[j])))) / 2
+    alike = turn < np.radians(SAME_BLOCK_DEG)
+    graph = coo_array((np.ones(alike.sum()), (i[alike], j[alike])), shape=(len(rows), len(rows)))
+    labels: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    return labels
+
+
+def describe_rows(
+    rows: gpd.GeoDataFrame, *, parcel: str, origin: Origin, threshold: float = 2.0
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Describe numbered rows as Table 2.1 does.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineStringZ in a projected CRS with ``row_id``.
+    parcel : str
+        Name that follows the number in a row's label ("1 F").
+    origin : Origin
+        Origin of {Main}.
+    threshold : float
+        Metres t between enhanced key points, which stand at equal distances of about that along γ.
+
+    Returns
+    -------
+    rows : GeoDataFrame
+        With ``label``, ``length_m`` (3-D), ``orientation_deg`` (mean, anticlockwise from the west–east axis, in
+        (-90, 90]), ``elevation_m`` (mean along the row), ``elevation_diff_m`` (en − e1), ``n_key_points``, and both
+        ends as ``e1_x`` … ``en_z`` in {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
+    row_ends : GeoDataFrame
+        PointZ in EPSG:4326 with ``row_id``, ``label``, ``end`` ("e1" or "en").
+    key_points : GeoDataFrame
+        PointZ with ``row_id``, ``label``, ``order`` (1 … n) and ``position_m`` along γ.
+    """
+    labels = [f"{i} {parcel}" for i in rows["row_id"]]
+    lines = [shapely.get_coordinates(line, include_z=True) for line in rows.geometry]
+    n_points = [max(2, round(_length(xyz) / threshold) + 1) for xyz in lines]
+    ends = np.array([xyz[[0, -1]] for xyz in lines]).reshape(-1, 3)
+    main = to_main(ends, rows.crs, origin).reshape(-1, 2, 3)
+    wgs84 = to_wgs84(ends, rows.crs)
+    table = {
+        "label": labels,
+        "length_m": [_length(xyz) for xyz in lines],
+        "orientation_deg": [_orientation(xyz) for xyz in lines],
+        "elevation_m": [_mean_elevation(xyz) for xyz in lines],
+        "elevation_diff_m": [float(xyz[-1, 2] - xyz[0, 2]) for xyz in lines],
+        "n_key_points": np.array(n_points, dtype=np.int64),
+    }
+    for e, end in enumerate(("e1", "en")):
+        table |= {f"{end}_{axis}": main[:, e, k] for k, axis in enumerate("xyz")}
+    for e, end in enumerate(("e1", "en")):
+        table |= {f"{end}_{name}": wgs84[e::2, k] for k, name in enumerate(("lat", "lon", "alt"))}
+    row_ends = gpd.GeoDataFrame(
+        {
+            "row_id": np.repeat(rows["row_id"].to_numpy(), 2),
+            "label": np.repeat(np.array(labels, dtype=object), 2),
+            "end": ["e1", "en"] * len(rows),
+        },
+        geometry=gpd.points_from_xy(wgs84[:, 1], wgs84[:, 0], wgs84[:, 2]),
+        crs=WGS84,
+    )
+    return rows.assign(**table), row_ends, _key_points(rows, labels, n_points)
+
+
+def _key_points(rows: gpd.GeoDataFrame, labels: list[str], n_points: list[int]) -> gpd.GeoDataFrame:
+    parts = []
+    for row_id, label, n, line in zip(rows["row_id"], labels, n_points, rows.geometry, strict=True):
+        position = np.linspace(0, line.length, n)
+        points = shapely.line_interpolate_point(line, position)
+        order = np.arange(1, n + 1)
+        parts.append(pd.DataFrame({"row_id": row_id, "label": label, "order": order, "position_m": position, "p": points}))
+    columns = ["row_id", "label", "order", "position_m", "p"]
+    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+    return gpd.GeoDataFrame(table.drop(columns="p"), geometry=gpd.GeoSeries(list(table["p"])), crs=rows.crs)
+
+
+def _length(xyz: Values) -> float:
+    return float(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum())
+
+
+def _orientation(xyz: Values) -> float:
+    """Mean direction in degrees of a curve that runs eastwards, in (-90, 90]."""
+    way = np.diff(xyz[:, :2], axis=0)
+    chord = np.arctan2(*(xyz[-1, :2] - xyz[0, :2])[::-1])
+    turn = np.angle(np.exp(1j * (np.arctan2(way[:, 1], way[:, 0]) - chord)))
+    mean = np.degrees(chord + np.average(turn, weights=np.hypot(*way.T)))
+    return float(90 - (90 - mean) % 180)
+
+
+def _mean_elevation(xyz: Values) -> float:
+    step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
+    return float(np.average((xyz[1:, 2] + xyz[:-1, 2]) / 2, weights=step))
