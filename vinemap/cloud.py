@@ -1,9 +1,9 @@
-"""Point clouds: reading LAS, LAZ and COPC into metres of one projected CRS."""
+"""Point clouds: reading LAS, LAZ and COPC into metres of one projected CRS; sections of a cloud."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     import shapely
     from numpy.typing import NDArray
     from pyproj import CRS
+
+    Values = NDArray[np.float64]
 
 CHUNK = 1_000_000
 LARGEST_SPAN = 50_000.0
@@ -37,6 +39,35 @@ class PointCloud:
     crs: CRS
     fields: dict[str, NDArray[Any]] = field(default_factory=dict)
     vertical: str | None = None
+
+
+class Sections(NamedTuple):
+    """Sections S_k of all rows, ordered by row and position, with their points one after the other.
+
+    Points ``start[k]`` to ``start[k + 1]`` are those of section k; a point may be in two sections (a > b).
+    """
+
+    row_id: NDArray[np.int64]
+    """Row (m,) of each section."""
+    position: Values
+    """Metres (m,) along γ."""
+    origin: Values
+    """Points (m, 3) of γ at soil level in the parcel's CRS: the origins of {LOC_k}."""
+    tangent: Values
+    """Horizontal unit vectors (m, 2) along γ: the x axes of {LOC_k}."""
+    spacing: Values
+    """Local inter-row spacing δ (m,) in metres."""
+    start: NDArray[np.int64]
+    """First point (m + 1,) of each section."""
+    points: Values
+    """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
+    height: Values
+    """Height above the terrain model (n,) in metres."""
+
+    @property
+    def section(self) -> NDArray[np.int64]:
+        """Section (n,) of each point."""
+        return np.repeat(np.arange(len(self.row_id)), np.diff(self.start))
 
 
 def read_cloud(

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import geopandas as gpd
 import numpy as np
 
-from vinemap.raster import Grid, Raster, sample
+from vinemap.raster import sample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.row_field import RowField
+    from vinemap.raster import Grid, Raster, RowField
 
     Values = NDArray[np.float64]
 

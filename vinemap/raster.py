@@ -54,6 +54,15 @@ class Raster:
     crs: CRS
 
 
+@dataclass(frozen=True)
+class RowField:
+    """Rasters of direction (degrees anticlockwise from east, axial in [0, 180)), spacing (m), likelihood (0–1)."""
+
+    direction: Raster
+    spacing: Raster
+    likelihood: Raster
+
+
 def grid_over(xy: ArrayLike, *, resolution: float) -> Grid:
     """Smallest grid over points (n, ≥2), its edges at multiples of the cell size.
 

@@ -6,7 +6,6 @@ spectrum lies across the rows at one cycle a spacing (Delenne et al. 2008; the t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import rfft2
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, map_coordinates, maximum_filter
 
-from vinemap.raster import Grid, Raster, cell_of, coarser, count, grid_over
+from vinemap.raster import Grid, Raster, RowField, cell_of, coarser, count, grid_over
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,15 +29,6 @@ COVER_RESOLUTION = 0.25
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 BATCH = 512
-
-
-@dataclass(frozen=True)
-class RowField:
-    """Rasters of direction (degrees anticlockwise from east, axial in [0, 180)), spacing (m), likelihood (0–1)."""
-
-    direction: Raster
-    spacing: Raster
-    likelihood: Raster
 
 
 class _Peaks(NamedTuple):

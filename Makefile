@@ -1,0 +1,56 @@
+# The verbs of this project; `make` alone lists them. What needs Python sets up .venv by itself.
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+CONFIG ?= configs/barolo.yaml
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+LOG := $(VENV)/install.log
+
+.PHONY: help parcel test check clean
+
+help: ## List the verbs
+	@echo "make VERB, where VERB is one of"
+	@sed -nE 's/^([a-z]+):[^#]*## (.*)$$/\1 \2/p' $(firstword $(MAKEFILE_LIST)) | \
+	  while read -r verb does; do printf '  %-8s %s\n' "$$verb" "$$does"; done
+
+parcel: export CONFIG := $(CONFIG)
+parcel: export PARCEL := $(PARCEL)
+parcel: $(if $(strip $(PARCEL)),$(READY)) ## Map one parcel: make parcel PARCEL=F [CONFIG=configs/barolo.yaml]
+ifeq ($(strip $(PARCEL)),)
+	@echo "Name the parcel, for example: make parcel PARCEL=F" >&2; exit 2
+else
+	@$(BIN)/python -m flows.parcel "$$CONFIG" "$$PARCEL"
+endif
+
+test: $(READY) ## Run the tests
+	@$(BIN)/python -m pytest
+
+check: $(READY) ## Check style, format and types
+	@$(BIN)/python -m ruff check
+	@$(BIN)/python -m ruff format --check
+	@$(BIN)/python -m mypy
+
+clean: ## Remove .venv and the tools' caches; surveys and products stay
+	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	@find flows tests vinemap -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(READY): pyproject.toml configs/constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "vinemap needs Python 3.11 or newer, $(PYTHON) is $$($(PYTHON) -V 2>&1 | tail -n 1): try make PYTHON=python3.11" >&2; \
+	  exit 2; \
+	}
+	@if [ -e $@ ]; then echo "Bringing $(VENV) up to date…"; else echo "Setting up $(VENV) (about 1.6 GB, a minute or two)…"; fi
+	@rm -f $@; mkdir -p $(VENV)
+	@{ $(PYTHON) -m venv $(VENV) && \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[dev]'; \
+	} >$(LOG) 2>&1 || { \
+	  grep -v 'is ignored: it is neither' $(LOG) | tail -n 15 >&2; \
+	  echo "Setting up $(VENV) failed; all that was said stands in $(LOG)" >&2; \
+	  exit 1; \
+	}
+	@touch $@

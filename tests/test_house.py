@@ -1,0 +1,147 @@
+"""The house's own rules: who imports whom, names, what starts quickly, what is pinned."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
+
+BASE = {"errors", "crs"}
+DATA = {"cloud", "raster", "vector", "mesh"}
+STAGES = {"ground", "row_field", "key_points", "clustering", "curves", "row_table"}
+STAGES |= {"sections", "canopy", "cgon", "odometry"}
+BESIDE = {"evaluate", "synthetic"}
+SETTINGS = {"config", "paths"}
+CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
+# What each module of vinemap, and any flow, may import of vinemap. Its version is everyone's.
+MAY_IMPORT = {
+    "__init__": set(),
+    "errors": set(),
+    "crs": {"errors"},
+    **dict.fromkeys(DATA, BASE | DATA),
+    **dict.fromkeys(STAGES, BASE | DATA),
+    **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
+    **dict.fromkeys(SETTINGS, BASE),
+    "parcel": CHAIN,
+    "cli": CHAIN | {"parcel"},
+    "__main__": {"cli"},
+    "flows": CHAIN | {"parcel", "cli", "flows"},
+}
+
+
+def imports(source, package):
+    """Return the dotted names that a module imports anywhere in it, for type checking as well."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            origin = ".".join(filter(None, [package if node.level else "", node.module]))
+            names |= {f"{origin}.{alias.name}" for alias in node.names}
+    return names
+
+
+def breaches(source, package, module):
+    """Return what a module imports against the rule; a module is what its name or its flow's package stands for."""
+    me = "flows" if package == "flows" else module
+    if me not in MAY_IMPORT:
+        return [f"{module}: give it a place in tests/test_house.py"]
+    wrong = []
+    for name in sorted(imports(source, package)):
+        top, _, rest = name.partition(".")
+        if top == "flows":
+            other = "flows"
+        elif top == "vinemap":
+            other = rest.split(".")[0]
+        else:
+            other = top if top == "prefect" else ""
+        ours = other in MAY_IMPORT or other == "prefect"
+        if ours and other != me and other not in MAY_IMPORT[me] | ({"prefect"} if me == "flows" else set()):
+            wrong.append(f"{module} imports {other}")
+    return wrong
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    assert breaches(path.read_text(encoding="utf-8"), path.relative_to(ROOT).parts[0], path.stem) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "module", "wrong"),
+    [
+        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", []),
+        ("from vinemap.cloud import PointCloud", "evaluate", []),
+        ("from vinemap.key_points import find", "curves", ["key_points"]),
+        ("from vinemap import curves, raster", "key_points", ["curves"]),
+        ("import vinemap.parcel", "ground", ["parcel"]),
+        ("from . import cloud", "errors", ["cloud"]),
+        ("from .vector import write", "crs", ["vector"]),
+        ("if TYPE_CHECKING:\n    from vinemap.row_field import RowField", "mesh", ["row_field"]),
+        ("def f():\n    from vinemap.config import Config", "curves", ["config"]),
+        ("from vinemap.config import Config\nfrom vinemap import paths", "parcel", []),
+        ("from vinemap.paths import product", "config", ["paths"]),
+        ("from vinemap.raster import Raster", "synthetic", ["raster"]),
+        ("from prefect import task", "parcel", ["prefect"]),
+        ("import prefect.futures", "cli", ["prefect"]),
+        ("from flows.parcel import map_parcel", "cli", ["flows"]),
+        ("from vinemap.cli import main", "parcel", ["cli"]),
+    ],
+)
+def test_the_rule_sees_a_breach(source, module, wrong):
+    assert breaches(source, "vinemap", module) == [f"{module} imports {other}" for other in wrong]
+
+
+def test_flows_are_the_only_place_for_prefect():
+    assert breaches("from prefect import flow\nfrom vinemap.parcel import map_parcel", "flows", "parcel") == []
+
+
+def test_a_new_module_needs_a_place():
+    assert "give it a place" in breaches("", "vinemap", "gadgets")[0]
+
+
+def test_every_room_has_a_purpose_in_its_name():
+    assert [path for path in MODULES if re.fullmatch(r"_*(utils?|helpers?|misc|common)", path.stem)] == []
+
+
+@pytest.mark.skipif(not (ROOT / "vinemap" / "cli.py").exists(), reason="no command line yet")
+def test_the_command_line_starts_without_heavy_libraries():
+    code = "import json, sys, vinemap.cli; print(json.dumps(sorted(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {"prefect", "open3d", "geopandas", "rasterio"} & set(json.loads(run.stdout)) == set()
+
+
+def constraints():
+    lines = (ROOT / "configs" / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def key(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_constraints_are_names_and_versions():
+    assert [line for line in constraints() if not re.fullmatch(r"[A-Za-z0-9][\w.-]*==[0-9][A-Za-z0-9.]*", line)] == []
+    names = [key(line.split("==")[0]) for line in constraints()]
+    assert len(names) == len(set(names))
+
+
+def test_constraints_cover_what_the_project_needs():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    pinned = {key(line.split("==")[0]) for line in constraints()}
+    assert {key(re.match(r"[\w.-]+", need)[0]) for need in needed} - pinned == set()
+
+
+def test_constraints_hold_the_set_with_which_prefect_runs():
+    versions = {key(name): version for name, version in (line.split("==") for line in constraints())}
+    release = {name: tuple(map(int, versions[name].split(".")[:2])) for name in ("prefect", "fastapi", "sqlalchemy")}
+    assert (3, 8) <= release["prefect"] < (4, 0)
+    assert release["fastapi"] < (0, 151)
+    assert release["sqlalchemy"] < (2, 1)

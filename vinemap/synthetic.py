@@ -1,0 +1,604 @@
+"""Simulated UAV surveys of vineyards whose rows, dead vines and ground are known exactly.
+
+Rays come down as from several flight positions, find leaves with a chance per metre of foliage, else the
+ground, and are then spoilt as photogrammetry spoils points: noise, points bled at depth edges, floaters.
+So tops and sides are seen unevenly, the foot of the canopy hardly, the ground below it seldom.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.linalg import block_diag
+from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
+from scipy.spatial import cKDTree
+
+from vinemap.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
+
+Array = NDArray[np.float64]
+Terrain = Callable[[Array, Array], Array]
+"""Elevation (m) of the ground at x (east) and y (north)."""
+
+PLACE = (414750.0, 4940780.0)
+"""Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
+TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
+TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
+ROW_14_BEND = 0.6
+"""How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
+
+STATION = 0.1  # spacing of canopy stations along a row (m)
+CELL = 0.25  # cells in which rays are dealt out (m)
+BARE = 40  # cells without foliage beyond each end of a row, more than a ray crosses
+LAYERS = 16  # heights at which the foliage of a station has a density of its own
+STEPS = 14  # steps of a ray through a canopy
+EDGE = 0.06  # depth over which foliage thins out at its surface (m)
+TAN_WIDEST = math.tan(math.radians(35))
+CHUNK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Vineyard:
+    """Rows of one parcel and how they grow; lengths in metres."""
+
+    name: str
+    rows: Sequence[Array]
+    """Polylines (n, 2) from e1 to en, along which the foliage stands."""
+    height: float = 1.95
+    half_width: float = 0.27
+    bottom: float = 0.55
+    """Height above ground where foliage begins."""
+    leafiness: float = 9.0
+    """Leaves that a ray meets in a metre of foliage."""
+    vine_spacing: float = 0.9
+    dead: float = 0.05
+    """Share of single dead vines."""
+    gaps: Sequence[int] = ()
+    """Runs of so many dead vines, dealt to rows at random."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A tree (ellipsoid of leaves) or a hut (solid box); lengths in metres, heights above its ground."""
+
+    x: float
+    y: float
+    half_length: float
+    half_width: float
+    top: float
+    bottom: float = 0.0
+    solid: bool = False
+
+
+class Survey(NamedTuple):
+    """A simulated survey and its truth, in one projected CRS."""
+
+    name: str
+    xyz: Array
+    """Points (n, 3), m, on a grid of 1 mm."""
+    rows: gpd.GeoDataFrame
+    """LineStringZ on the ground between the ends of the foliage; parcel, row, length_3d, n_vines, n_dead,
+    mean_height, mean_width."""
+    dead_vines: gpd.GeoDataFrame
+    """PointZ; parcel, row, vine (1 is at e1)."""
+    parcels: gpd.GeoDataFrame
+    """Polygons; name."""
+    terrain: Terrain
+
+
+class _Stations(NamedTuple):
+    """Canopy in cells along all rows, concatenated; every row goes on bare for BARE cells at both ends."""
+
+    row: NDArray[np.intp]
+    xy: Array
+    along: Array  # unit tangents (n, 2)
+    arc: Array  # distance from e1
+    step: Array  # length of the cell
+    ground: Array
+    top: Array  # heights above ground
+    bottom: Array
+    half_width: Array  # -1 where bare
+    shift: Array  # of the foliage's middle, to the left
+    leaves: Array  # (n, LAYERS) per metre
+
+
+def rows_of(
+    n: int = 8,
+    *,
+    length: float = 40.0,
+    spacing: float = 2.5,
+    azimuth: float = 0.0,
+    radius: float = math.inf,
+    fan: float = 0.0,
+    centre: tuple[float, float] = PLACE,
+) -> list[Array]:
+    """Rows side by side: parallel, fanned, or on concentric arcs.
+
+    Parameters
+    ----------
+    n, length, spacing : int, float, float
+        Number of rows, length of the middle one and distance between them (m).
+    azimuth : float
+        Direction of the rows, degrees anticlockwise from east. Rows are numbered towards its left.
+    radius : float
+        Of the middle row (m); positive bends to the left. Rows on arcs subtend the same angle.
+    fan : float
+        Angle between the first and the last row (degrees), each turned about its middle.
+    centre : tuple
+        Middle of the block, x and y (m).
+
+    Returns
+    -------
+    list of array (m, 2)
+    """
+    u = np.linspace(-length / 2, length / 2, int(length / 0.25) + 2)
+    rows = []
+    for i in range(n):
+        v = (i - (n - 1) / 2) * spacing
+        if math.isfinite(radius):
+            along, across = (radius - v) * np.sin(u / radius), radius - (radius - v) * np.cos(u / radius)
+        else:
+            turn = math.radians(fan) * (i / max(n - 1, 1) - 0.5)
+            along, across = u * math.cos(turn), v + u * math.sin(turn)
+        cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+        rows.append(np.column_stack([centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos]))
+    return rows
+
+
+def waves(rng: np.random.Generator, wavelength: float) -> Terrain:
+    """Smooth random surface of mean 0 and variance 1, with waves of about ``wavelength`` (m)."""
+    n = 8
+    wave = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.6, n))
+    heading, phase = rng.uniform(0, 2 * np.pi, (2, n))
+
+    def surface(x: Array, y: Array) -> Array:
+        total = np.zeros(np.shape(x))
+        for k in range(n):
+            total += np.sin(wave[k] * (x * math.cos(heading[k]) + y * math.sin(heading[k])) + phase[k])
+        return total * math.sqrt(2 / n)
+
+    return surface
+
+
+def hillside(
+    slope: float = 0.1,
+    *,
+    uphill: float = 90.0,
+    undulation: float = 0.1,
+    elevation: float = 300.0,
+    centre: tuple[float, float] = PLACE,
+    seed: int = 0,
+) -> Terrain:
+    """Plane of ``slope`` (rise over run) that rises towards ``uphill`` (degrees anticlockwise from east).
+
+    ``undulation`` is the standard deviation (m) of waves of about 25 m on it, ``elevation`` its height at ``centre``.
+    """
+    bumps = waves(np.random.default_rng(seed), 25.0)
+    dx, dy = slope * math.cos(math.radians(uphill)), slope * math.sin(math.radians(uphill))
+    return lambda x, y: elevation + dx * (x - centre[0]) + dy * (y - centre[1]) + undulation * bumps(x, y)
+
+
+def terraced(terrain: Terrain, rows: Sequence[Array], *, spacing: float = 2.5, riser: float = 0.8) -> Terrain:
+    """Cut a slope into treads, level across each row, and risers ``riser`` m wide half way between rows."""
+    points = np.concatenate(rows)
+    tangents = np.concatenate([np.gradient(row, axis=0) for row in rows])
+    normals = np.column_stack([-tangents[:, 1], tangents[:, 0]]) / np.linalg.norm(tangents, axis=1, keepdims=True)
+    tree = cKDTree(points)
+
+    def surface(x: Array, y: Array) -> Array:
+        xy = np.column_stack([np.ravel(x), np.ravel(y)])
+        nearest = tree.query(xy)[1]
+        across = np.sum((xy - points[nearest]) * normals[nearest], axis=1)
+        edge = np.clip((np.abs(across) - (spacing - riser) / 2) / (riser / 2), 0, 1)
+        cut = np.minimum(np.abs(across), spacing / 2) * (1 - edge**2 * (3 - 2 * edge)) * np.sign(across)
+        foot = xy - cut[:, None] * normals[nearest]
+        return terrain(foot[:, 0], foot[:, 1]).reshape(np.shape(x))
+
+    return surface
+
+
+def surface_through(
+    means: Sequence[tuple[Array, float]], base: Terrain, *, cell: float = 1.5, margin: float = 50.0
+) -> Terrain:
+    """Bend ``base`` as little as possible (thin plate) until its mean over each set of points is as given.
+
+    Parameters
+    ----------
+    means : sequence of (array (k, 2), float)
+        Points and the mean elevation over them (m); a single point fixes the surface there.
+    base : callable
+        Surface to start from.
+    cell, margin : float
+        The surface is held on a grid of this cell (m), wider than the points by ``margin`` (m) all round.
+    """
+    points = np.concatenate([xy for xy, _ in means])
+    origin, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+    averaging = block_diag(*[np.full((1, len(xy)), 1 / len(xy)) for xy, _ in means])
+
+    def kernel(a: Array) -> Array:
+        squared = np.sum((a[:, None] - points[None]) ** 2, axis=-1)
+        return np.asarray(squared * np.log(np.maximum(squared, 1e-12)))
+
+    def plane(a: Array) -> Array:
+        return np.column_stack([np.ones(len(a)), (a - origin) / 100])
+
+    wanted = np.array([z for _, z in means]) - averaging @ base(*points.T)
+    flat = averaging @ plane(points)
+    system = np.block([[averaging @ kernel(points) @ averaging.T, flat], [flat.T, np.zeros((3, 3))]])
+    weights = np.linalg.solve(system, np.concatenate([wanted, np.zeros(3)]))
+    nx, ny = np.ceil((upper - origin) / cell).astype(int) + 1
+    nodes = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2) * cell + origin
+    bend = [kernel(part) @ (averaging.T @ weights[:-3]) for part in np.array_split(nodes, len(nodes) // 1000 + 1)]
+    grid = np.concatenate(bend) + plane(nodes) @ weights[-3:] + base(*nodes.T)
+    spline = spline_filter(grid.reshape(nx, ny), order=3, mode="nearest")
+
+    def surface(x: Array, y: Array) -> Array:
+        at = np.stack([(x - origin[0]) / cell, (y - origin[1]) / cell])
+        return np.asarray(map_coordinates(spline, at, order=3, mode="nearest", prefilter=False))
+
+    return surface
+
+
+def simulate(
+    vineyards: Sequence[Vineyard],
+    terrain: Terrain,
+    *,
+    name: str = "synthetic",
+    crs: str = "EPSG:32632",
+    density: float = 400.0,
+    density_outside: float = 60.0,
+    surroundings: float = 6.0,
+    obstacles: Sequence[Obstacle] = (),
+    weeds: float = 0.15,
+    noise: float = 0.025,
+    bled: float = 0.01,
+    floaters: float = 0.0005,
+    seed: int = 0,
+) -> Survey:
+    """Survey vineyards from the air.
+
+    Parameters
+    ----------
+    vineyards : sequence of Vineyard
+        One a parcel, with rows in ``crs``.
+    terrain : callable
+        Elevation of the ground (m).
+    density, density_outside, surroundings : float
+        Rays a square metre (30% more or less, in patches; nearly as many points) inside the parcels, and on
+        the ``surroundings`` m about their common hull.
+    obstacles : sequence of Obstacle
+        Trees and huts.
+    weeds : float
+        Height (m) of the weeds, which cover about a quarter of the ground in patches.
+    noise : float
+        Standard deviation (m) of points, upwards on the ground, all ways in the canopy.
+    bled, floaters : float
+        Shares of points that hang between canopy and ground, and metres above or below it.
+    seed : int
+        The same seed gives the same survey.
+    """
+    rng = np.random.default_rng(seed)
+    dead = [vines for vineyard in vineyards for vines in _dead_vines(vineyard, rng)]
+    stations = _grow(vineyards, dead, terrain, rng)
+    rows, dead_vines, parcels = _truth(vineyards, dead, stations, terrain, crs)
+    hulls = shapely.union_all(parcels.geometry.to_numpy())
+    outline = hulls.convex_hull.buffer(surroundings)
+
+    corner = np.floor(np.array(outline.bounds[:2]))
+    nx, ny = np.ceil((np.array(outline.bounds[2:]) - corner) / CELL).astype(int) + 1
+    centres = (np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1).reshape(-1, 2) + 0.5) * CELL + corner
+    distance, nearest = cKDTree(stations.xy).query(centres, distance_upper_bound=2.0)
+    shapely.prepare([hulls, outline])
+    rate = np.where(shapely.contains_xy(outline, *centres.T), density_outside, 0.0)
+    rate[shapely.contains_xy(hulls, *centres.T)] = density
+    rate *= np.clip(1 + 0.2 * waves(rng, 12.0)(*centres.T), 0.4, 1.6)
+    rays = np.repeat(np.arange(len(centres)), rng.poisson(rate * CELL**2))
+    heading = rng.uniform(0, 2 * np.pi) + 0.8 * waves(rng, 35.0)(*centres.T)
+    tufts = weeds * np.clip(waves(rng, 7.0)(*centres.T) - 0.6, 0, 0.8) / 0.8
+    row_at = np.append(stations.row, -1)  # a cell with no row near names the station past the last
+    hidden = 0.65 * (distance < np.append(stations.half_width, -1.0)[nearest])
+
+    def nearest_at(xy: Array) -> NDArray[np.intp]:
+        i, j = np.clip(((xy - corner) / CELL).astype(int), 0, [nx - 1, ny - 1]).T
+        return np.asarray(nearest[j * nx + i])
+
+    clouds = []
+    for cells in np.array_split(rays, len(rays) // CHUNK + 1):
+        n = len(cells)
+        xy = centres[cells] + rng.uniform(-CELL / 2, CELL / 2, (n, 2))
+        aim = np.column_stack([xy, terrain(*xy.T)])
+        # Three quarters of the views come from one side, so the other side of a canopy is seen less.
+        toward = heading[cells] + rng.normal(0, 0.9, n) + np.pi * (rng.random(n) < 0.25)
+        lean = (TAN_WIDEST * rng.random(n) ** 0.7)[:, None] * np.column_stack([np.cos(toward), np.sin(toward)])
+
+        # A leaning ray may pass one row high up and its neighbour low down.
+        upper, lower = nearest_at(xy + 1.6 * lean), nearest_at(xy + 0.5 * lean)
+        rise = _meet_leaves((aim, lean), upper, 1.6, stations, rng)
+        two = np.flatnonzero(row_at[upper] != row_at[lower])
+        rise[two] = np.maximum(rise[two], _meet_leaves((aim[two], lean[two]), lower[two], 0.5, stations, rng))
+        for obstacle in obstacles:
+            rise = np.maximum(rise, _meet_obstacle(aim, lean, obstacle, terrain, rng))
+
+        leaf = rise > 0
+        edges = np.flatnonzero(leaf)
+        edges = rng.choice(edges, min(len(edges), rng.binomial(n, bled)), replace=False)
+        rise[edges] *= rng.uniform(0.03, 0.97, len(edges))
+        points = aim + np.column_stack([lean * rise[:, None], rise])
+        spread = np.where(leaf[:, None], noise, noise * np.array([0.3, 0.3, 1.0]))
+        spread[edges, :2] = 3 * noise
+        points += rng.normal(size=(n, 3)) * spread
+        points[:, 2] += np.where(leaf, 0, tufts[cells] * rng.random(n))
+        flyers = np.flatnonzero(rng.random(n) < floaters)
+        points[flyers, 2] += rng.choice([-1, 1], len(flyers)) * rng.uniform(0.5, 8.0, len(flyers))
+        clouds.append(points[leaf | (rng.random(n) >= hidden[cells])])
+    return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, parcels, terrain)
+
+
+def barolo(*, density: float = 380.0, density_outside: float = 60.0, seed: int = 1, table: Path = TABLE_2_1) -> Survey:
+    """Survey of three parcels in Barolo, EPSG:32632: Table 2.1's parcel F, a contour vineyard, two blocks.
+
+    F's rows end where the thesis's do and keep its mean elevations; the rest of the hillside is made up.
+
+    Parameters
+    ----------
+    density, density_outside : float
+        Rays a square metre inside parcels and outside.
+    table : path
+        Table 2.1 as CSV.
+    """
+    data = np.genfromtxt(table, delimiter=",", names=True)
+    crs = parse_crs("EPSG:32632")
+    main = [np.column_stack([data[f"{axis}{end}"] for axis in "xyz"]) for end in ("1", "n_corrected")]
+    e1, en = (from_wgs84(main_to_wgs84(end, TABLE_2_1_ORIGIN), crs) for end in main)
+    along = np.linspace(0, 1, 61)[:, None]
+    rows = [first + (last - first) * along for first, last in zip(e1[:, :2], en[:, :2], strict=True)]
+    chord = en[13, :2] - e1[13, :2]
+    length = float(np.linalg.norm(chord))
+    nearest = (e1[14, :2] - e1[13, :2]) @ chord / length**2
+    bend = PchipInterpolator([0, nearest, 1], [0, -ROW_14_BEND, 0])(np.linspace(0, 1, 241))[:, None]
+    rows[13] = e1[13, :2] + chord * np.linspace(0, 1, 241)[:, None] + bend * np.array([-chord[1], chord[0]]) / length
+
+    curved = rows_of(10, length=60, radius=50, azimuth=20, centre=(414865, 4940773))
+    blocks = rows_of(8, length=40, spacing=2.4, azimuth=-80, centre=(414764, 4940736))
+    blocks += rows_of(9, length=35, spacing=2.8, azimuth=-35, centre=(414800, 4940733))
+    # {Main} is a tangent plane: what lies 0.4 km from its origin stands 1 cm higher above the ellipsoid.
+    lift = np.mean([e1[:, 2] - main[0][:, 2], en[:, 2] - main[1][:, 2]], axis=0)
+    means = [(end[None, :2], float(end[2])) for end in np.concatenate([e1, en])]
+    means += [(row, float(z)) for row, z in zip(rows, data["elevation_as_printed_m"] + lift, strict=True)]
+    contours = np.concatenate([row[::24] for row in curved[::3]])
+    apex = np.array([414865 - 50 * math.sin(math.radians(20)), 4940773 + 50 * math.cos(math.radians(20))])
+    up = 474 + 0.25 * (50 - np.linalg.norm(contours - apex, axis=1)) + 0.03 * (contours[:, 0] - 414865)
+    means += [(xy[None], float(z)) for xy, z in zip(contours, up, strict=True)]
+    terrain = surface_through(means, hillside(0.15, uphill=100, undulation=0.06, elevation=467, seed=seed))
+    return simulate(
+        [
+            Vineyard("F", rows, gaps=(2, 3, 3, 4, 5)),
+            Vineyard("curved", curved, height=1.85, half_width=0.25, gaps=(2, 3, 4, 5)),
+            Vineyard("blocks", blocks, height=2.0, half_width=0.3, dead=0.04, gaps=(2, 3, 5)),
+        ],
+        terrain,
+        name="barolo",
+        density=density,
+        density_outside=density_outside,
+        obstacles=[
+            Obstacle(414784, 4940725, 2.2, 2.0, 5.2, bottom=1.4),
+            Obstacle(414783, 4940750, 2.0, 1.6, 2.7, solid=True),
+        ],
+        seed=seed,
+    )
+
+
+def write_survey(survey: Survey, folder: Path | str) -> Path:
+    """Write ``<name>.laz``, ``parcels.gpkg`` and ``truth.gpkg`` (layers rows, dead_vines); return the first.
+
+    All three are made aside and then moved into ``folder``, the cloud last, so nothing half-made is ever there.
+    """
+    import laspy  # noqa: PLC0415 - only the writer needs it
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(survey.xyz.min(axis=0))
+    header.add_crs(survey.rows.crs)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = survey.xyz.T
+    with tempfile.TemporaryDirectory(prefix=".writing-", dir=folder) as aside:
+        survey.parcels.to_file(Path(aside, "parcels.gpkg"), layer="parcels", VERSION="1.2")
+        survey.rows.to_file(Path(aside, "truth.gpkg"), layer="rows", VERSION="1.2")
+        survey.dead_vines.to_file(Path(aside, "truth.gpkg"), layer="dead_vines", mode="a")
+        cloud.write(str(Path(aside, f"{survey.name}.laz")))
+        for made in ("parcels.gpkg", "truth.gpkg", f"{survey.name}.laz"):
+            Path(aside, made).replace(folder / made)
+    return folder / f"{survey.name}.laz"
+
+
+def _reached(row: Array) -> Array:
+    """Distance (n,) of a polyline's vertices from its start."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(row, axis=0), axis=1)))
+
+
+def _at(row: Array, distance: Array) -> Array:
+    """Points (m, 2) of a polyline at distances from its start."""
+    return np.column_stack([np.interp(distance, _reached(row), coordinate) for coordinate in row.T])
+
+
+def _dead_vines(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[np.bool_]]:
+    """Which vines of every row are dead; never a row's first or last, so that rows end where they say."""
+    counts = [max(round(_reached(row)[-1] / vineyard.vine_spacing), 3) for row in vineyard.rows]
+    dead = [rng.random(n) < vineyard.dead for n in counts]
+    order = rng.permutation(len(counts))
+    for k, run in enumerate(vineyard.gaps):
+        i = order[k % len(order)]
+        start = rng.integers(1, max(counts[i] - run, 2))
+        dead[i][start : start + run] = True
+    for vines in dead:
+        vines[[0, -1]] = False
+    return dead
+
+
+def _grow(
+    vineyards: Sequence[Vineyard], dead: Sequence[NDArray[np.bool_]], terrain: Terrain, rng: np.random.Generator
+) -> _Stations:
+    parts = []
+    plots = [(vineyard, row) for vineyard in vineyards for row in vineyard.rows]
+    for k, ((vineyard, row), vines) in enumerate(zip(plots, dead, strict=True)):
+        length = _reached(row)[-1]
+        step = length / math.ceil(length / STATION)
+        arc = (np.arange(-BARE, round(length / step) + BARE) + 0.5) * step
+        n, ends = len(arc), np.diff(row[[0, 1, -2, -1]], axis=0)[::2]
+        beyond = ends / np.linalg.norm(ends, axis=1, keepdims=True) * BARE * step
+        xy = _at(np.vstack([row[0] - beyond[0], row, row[-1] + beyond[1]]), arc + BARE * step)
+        along = np.gradient(xy, axis=0)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+
+        pitch = length / len(vines)
+        lows, highs = np.flatnonzero(np.diff(np.pad(vines.astype(int), 1))).reshape(-1, 2).T * pitch
+        lows, highs = lows + rng.uniform(-0.05, 0.12, len(lows)), highs - rng.uniform(-0.05, 0.12, len(highs))
+        lows, highs = np.append(lows, [-np.inf, length]), np.append(highs, [0.0, np.inf])
+        inside = np.maximum(lows[:, None] - arc, arc - highs[:, None]).min(axis=0)  # depth into the foliage
+
+        middles = (np.arange(len(vines)) + 0.5) * pitch
+        vigour, girth, lean, foot = (np.interp(arc, middles, rng.normal(size=len(vines))) for _ in range(4))
+        fine = gaussian_filter1d(rng.normal(size=(2, n)), 1.0, axis=1)
+        smooth = waves(rng, 18.0)
+        shoots = (rng.random((2, n)) < [[0.04], [0.03]]) * rng.random((2, n))
+        bottom = vineyard.bottom + 0.04 * foot
+        top = vineyard.height * (1 + 0.03 * smooth(arc, arc) + 0.035 * vigour + 0.03 * fine[0]) + 0.4 * shoots[0]
+        top = np.maximum(top - 0.3 * np.clip(1 - inside / 0.25, 0, 1), bottom + 0.2)
+        half_width = vineyard.half_width * (1 + 0.08 * smooth(arc, -arc) + 0.1 * girth + 0.1 * fine[1])
+        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(np.clip(inside / 0.12, 0, 1))
+        half_width[inside <= 0] = -1.0
+        thinning = np.linspace(0.5, 1.1, LAYERS)  # towards the shaded foot, of which little is ever matched
+        leaves = vineyard.leafiness * thinning * rng.gamma(1.5, 1 / 1.5, (n, LAYERS))
+        ground = terrain(*xy.T)
+        parts.append(
+            _Stations(
+                np.full(n, k), xy, along, arc, np.full(n, step), ground, top, bottom, half_width, 0.02 * lean, leaves
+            )
+        )
+    return _Stations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _truth(
+    vineyards: Sequence[Vineyard], dead: Sequence[NDArray[np.bool_]], stations: _Stations, terrain: Terrain, crs: str
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    rows, spots = [], []
+    plots = [(vineyard.name, i, row) for vineyard in vineyards for i, row in enumerate(vineyard.rows, 1)]
+    for k, ((name, i, row), vines) in enumerate(zip(plots, dead, strict=True)):
+        length = _reached(row)[-1]
+        xy = _at(row, np.linspace(0, length, math.ceil(length / 0.25) + 1))
+        line = np.column_stack([xy, terrain(*xy.T)])
+        alive = (stations.row == k) & (stations.half_width > 0)
+        height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean()
+        rows.append((name, i, _reached(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
+        gone = np.flatnonzero(vines)
+        xy = _at(row, (gone + 0.5) * length / len(vines))
+        spots += [
+            (name, i, vine + 1, shapely.Point(*point))
+            for vine, point in zip(gone, np.column_stack([xy, terrain(*xy.T)]), strict=True)
+        ]
+    hulls = [(plot.name, shapely.MultiLineString(list(plot.rows)).convex_hull.buffer(3.0)) for plot in vineyards]
+    canopy = ["length_3d", "n_vines", "n_dead", "mean_height", "mean_width"]
+
+    def frame(records: list[Any], columns: list[str]) -> gpd.GeoDataFrame:
+        table = pd.DataFrame(records, columns=[*columns, "geometry"])
+        return gpd.GeoDataFrame(table, geometry="geometry", crs=crs)
+
+    return (
+        frame(rows, ["parcel", "row", *canopy]),
+        frame(spots, ["parcel", "row", "vine"]),
+        frame(hulls, ["name"]),
+    )
+
+
+def _meet_leaves(
+    rays: tuple[Array, Array],
+    nearest: NDArray[np.intp],
+    at_height: float,
+    stations: _Stations,
+    rng: np.random.Generator,
+) -> Array:
+    """Height above ``aim`` at which rays meet a leaf of one row, 0 where they don't.
+
+    Parameters
+    ----------
+    rays : arrays (n, 3), (n, 2)
+        ``aim``, where they end on the ground, and ``lean``, their horizontal way for every metre up.
+    nearest, at_height : array (n,), float
+        The station nearest to a ray (one past the last: none near) where it passes this height above ``aim``.
+    """
+    aim, lean = rays
+    met = np.zeros(len(aim))
+    near = np.flatnonzero(nearest < len(stations.arc))
+    aim, lean, nearest = aim[near], lean[near], nearest[near]
+    offset = aim[:, :2] + at_height * lean - stations.xy[nearest]
+    (ax, ay), (lx, ly) = stations.along[nearest].T, lean.T
+    s, ds = offset[:, 0] * ax + offset[:, 1] * ay, lx * ax + ly * ay  # along the row, from the station
+    c, dc = offset[:, 1] * ax - offset[:, 0] * ay, ly * ax - lx * ay
+    dc = np.where(np.abs(dc) < 1e-9, 1e-9, dc)
+
+    widest = stations.half_width.max() + np.abs(stations.shift).max() + EDGE
+    level = stations.ground[nearest] - aim[:, 2]
+    one, two = at_height + (-widest - c) / dc, at_height + (widest - c) / dc
+    high = np.minimum(level + stations.top.max(), np.maximum(one, two))
+    low = np.maximum(np.maximum(level + stations.bottom.min(), 0.02), np.minimum(one, two))
+    through = np.flatnonzero(high > low)
+    s, ds, c, dc, high, low = (value[through] for value in (s, ds, c, dc, high, low))
+    nearest, z = nearest[through], aim[through, 2]
+    per_metre, last = 1 / stations.step[nearest], len(stations.arc) - 1
+
+    drop = (high - low) / STEPS
+    path = drop * np.sqrt(1 + np.sum(lean[through] ** 2, axis=1))
+    depth, needed, rise = np.zeros(len(z)), rng.exponential(size=len(z)), np.zeros(len(z))
+    up = high - drop * rng.random(len(z))
+    for _ in range(STEPS):
+        ahead = up - at_height
+        cell = np.clip(nearest + np.rint((s + ahead * ds) * per_metre).astype(int), 0, last)
+        base = stations.ground[cell] + stations.bottom[cell]
+        relative = (z + up - base) / (stations.top[cell] - stations.bottom[cell])
+        bulge = (relative - 0.4) / np.where(relative > 0.4, 0.62, 0.6)
+        width = stations.half_width[cell] * np.sqrt(np.maximum(1 - bulge**2, 0))
+        within = np.clip((width - np.abs(c + ahead * dc - stations.shift[cell])) / EDGE + 0.5, 0, 1)
+        within[(relative < 0) | (relative >= 1)] = 0
+        layer = (np.clip(relative, 0, 0.999) * LAYERS).astype(int)
+        depth += within * stations.leaves[cell, layer] * path
+        rise = np.where((rise == 0) & (depth >= needed), up, rise)
+        up -= drop
+    met[near[through]] = rise
+    return met
+
+
+def _meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain, rng: np.random.Generator) -> Array:
+    """Height above ``aim`` at which rays meet a tree or a hut, 0 where they don't."""
+    met = np.zeros(len(aim))
+    reach = math.hypot(obstacle.half_length, obstacle.half_width) + TAN_WIDEST * obstacle.top + 1
+    near = np.flatnonzero(np.hypot(aim[:, 0] - obstacle.x, aim[:, 1] - obstacle.y) < reach)
+    ground = float(terrain(np.array([obstacle.x]), np.array([obstacle.y]))[0])
+    half_height = (obstacle.top - obstacle.bottom) / 2
+    half = np.array([obstacle.half_length, obstacle.half_width, half_height])
+    # In units of the half axes: a point of the ray is start + rise * way.
+    start = (aim[near] - [obstacle.x, obstacle.y, ground + obstacle.bottom + half_height]) / half
+    way = np.column_stack([lean[near], np.ones(len(near))]) / half
+    if obstacle.solid:
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        faces = np.sort([(-1 - start) / way, (1 - start) / way], axis=0)
+        low, high = faces[0].max(axis=1), faces[1].min(axis=1)
+        rise = high
+    else:
+        a, b, c = (way**2).sum(axis=1), (way * start).sum(axis=1), (start**2).sum(axis=1) - 1
+        root = np.sqrt(np.maximum(b**2 - a * c, 0))
+        low, high = (-b - root) / a, (-b + root) / a
+        rise = high - rng.exponential(0.35, len(near))
+    met[near] = np.where((rise > np.maximum(low, 0)) & (high > low), rise, 0)
+    return met
