@@ -1,1 +1,9 @@
 """Prefect flows that chain the stages of vinemap."""
+
+import os
+
+# Prefect reads these when it is first imported. Its log goes to its own server; the terminal shows ours.
+os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
+os.environ.setdefault("PREFECT_SERVER_LOGGING_LEVEL", "CRITICAL")
+os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+os.environ.setdefault("DO_NOT_TRACK", "1")

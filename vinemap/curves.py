@@ -107,6 +107,7 @@ def trace_rows(
             piece = _line(_between(row.curve, start, end), dtm)
             gaps.append((cluster, start, end, end - start, piece))
     table = _frame(rows, ["cluster", "spacing_m", "width_m", "gap_m", "support"], cover)
+    table = table[~_repeated(table)]
     table = table[_accompanied(table) | (table.length >= 2 * min_length)].reset_index(drop=True)
     missing = _frame(gaps, ["cluster", "start_m", "end_m", "length_m"], cover)
     return table, missing[missing["cluster"].isin(table["cluster"])].reset_index(drop=True)
@@ -187,6 +188,19 @@ def _turn(curve: Values) -> float:
     k = max(1, len(curve) // 3)
     first, last = curve[k] - curve[0], curve[-1] - curve[-1 - k]
     return abs(float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last)))
+
+
+def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
+    """Whether a row lies for the most part within a quarter of a spacing of a longer one."""
+    lines = shapely.force_2d(rows.geometry.to_numpy())
+    out = np.zeros(len(rows), dtype=bool)
+    order = np.argsort(shapely.length(lines))
+    for n, i in enumerate(order):
+        longer = lines[order[n + 1 :]]
+        near = longer[shapely.dwithin(lines[i], longer, 0.25 * rows["spacing_m"].iloc[i])]
+        beside = shapely.union_all(shapely.buffer(near, 0.25 * rows["spacing_m"].iloc[i]))
+        out[i] = shapely.intersection(lines[i], beside).length > 0.5 * lines[i].length
+    return out
 
 
 def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:

@@ -27,6 +27,8 @@ COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
 STEP = 0.001
 """Heights are sorted in steps of a millimetre."""
+NARROWEST = 3.0
+"""Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
 RIDGE = 0.02
 """Weight that holds a local plane to the coarser surface where cells are few."""
 
@@ -98,6 +100,16 @@ def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
     return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
 
 
+def canopy_height_model(cloud: PointCloud, heights: Values, *, resolution: float = 0.25) -> Raster:
+    """Canopy height model: the 98% height in metres of each cell's points, NaN where there is none.
+
+    A quantile instead of the maximum, so that a single point in the air doesn't make a tower.
+    """
+    grid = grid_over(cloud.xyz, resolution=resolution)
+    cells = _order_statistics(heights, cell_of(cloud.xyz, grid), grid, 0.98)
+    return Raster(np.where(cells.n > 0, np.maximum(cells.low, 0), np.nan), grid, cloud.crs)
+
+
 def _coarse_surface(xyz: Values, grid: Grid) -> Values:
     """Smooth surface (ny, nx) through the low parts of a cloud, blind to what stands on it or floats below."""
     reference = float(np.median(xyz[:, 2]))
@@ -148,8 +160,32 @@ def _multiscale(level: Values, weight: Values, sigma: float) -> Values:
     """Local planes of width sigma (cells), held to ever wider ones where cells lack."""
     surface = np.zeros_like(level)
     for scale in (9.0, 3.0, 1.0):
-        surface = surface + _plane_fit(level - surface, weight, sigma * scale)
+        surface = surface + _decimated_fit(level - surface, weight, sigma * scale)
     return surface
+
+
+def _decimated_fit(level: Values, weight: Values, sigma: float) -> Values:
+    """:func:`_plane_fit` for wide planes on blocks of cells, brought back to the cells."""
+    k = int(sigma / NARROWEST)
+    if k < 2:
+        return _plane_fit(level, weight, sigma)
+    ny, nx = (-(-n // k) for n in level.shape)
+    padding = [(0, ny * k - level.shape[0]), (0, nx * k - level.shape[1])]
+
+    def blocks(values: Values) -> Values:
+        out: Values = np.pad(values, padding).reshape(ny, k, nx, k).mean(axis=(1, 3))
+        return out
+
+    mean_weight = blocks(weight)
+    mean_level = blocks(weight * level) / np.maximum(mean_weight, 1e-9)
+    wide = _plane_fit(mean_level, mean_weight, sigma / k)
+    i, j = ((np.arange(n) + 0.5) / k - 0.5 for n in level.shape)
+    for axis, at in ((0, i), (1, j)):
+        low = np.clip(np.floor(at).astype(int), 0, max(wide.shape[axis] - 2, 0))
+        part = (at - low)[:, None] if axis == 0 else (at - low)[None, :]
+        high = np.minimum(low + 1, wide.shape[axis] - 1)
+        wide = np.take(wide, low, axis) * (1 - part) + np.take(wide, high, axis) * part
+    return wide
 
 
 def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
@@ -161,7 +197,8 @@ def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
     kernels = bell, bell * t, bell * t**2
 
     def moment(values: Values, a: int, b: int) -> Values:
-        out: Values = correlate1d(correlate1d(values, kernels[a], axis=0, mode="constant"), kernels[b], axis=1, mode="constant")
+        down: Values = correlate1d(values, kernels[a], axis=0, mode="constant")
+        out: Values = correlate1d(down, kernels[b], axis=1, mode="constant")
         return out
 
     w, wi, wj = moment(weight, 0, 0), moment(weight, 1, 0), moment(weight, 0, 1)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import geopandas as gpd
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from vinemap.raster import sample
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.float64]
 
 BATCH = 20_000
+SLICES = 5
+"""Lines across the rows that are averaged in a slice."""
 
 
 def detect_key_points(
@@ -28,6 +31,7 @@ def detect_key_points(
     reach: float = 0.6,
     slice_width: float = 0.5,
     bin_width: float = 0.05,
+    smoothing: float = 0.15,
     min_cover: float = 0.12,
     min_likelihood: float = 0.1,
 ) -> gpd.GeoDataFrame:
@@ -47,6 +51,8 @@ def detect_key_points(
         Direction and spacing of the rows.
     grid_step, slice_width, bin_width : float
         Distance of the nodes, width of the slice along the rows and of the profile's bins, in metres.
+    smoothing : float
+        Standard deviation in metres of the Gaussian that smooths a profile: a hollow canopy has one maximum, not two.
     reach : float
         How far a profile reaches to both sides, in inter-row spacings. The thesis's cylinders of 5 m reach 2.
     min_cover, min_likelihood : float
@@ -60,7 +66,12 @@ def detect_key_points(
     nodes = _nodes(field, cover.grid, grid_step, min_likelihood)
     found = [np.empty((0, 5))]
     for start in range(0, len(nodes), BATCH):
-        found.append(_peaks(cover, nodes[start : start + BATCH], reach, slice_width, bin_width, min_cover))
+        batch = nodes[start : start + BATCH]
+        # Beyond its reach a profile goes on for what the Gaussian needs.
+        margin = 4 * smoothing + bin_width
+        profile, offsets = _profiles(cover, batch, reach * batch[:, 3].max() + margin, slice_width, bin_width)
+        profile = gaussian_filter1d(profile, smoothing / bin_width, axis=1)
+        found.append(_maxima(profile, offsets, batch, reach, min_cover))
     points = np.concatenate(found)
     z = sample(dtm, points[:, :2]) if len(points) else np.empty(0)
     return gpd.GeoDataFrame(
@@ -91,26 +102,29 @@ def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> V
     return np.column_stack([xy, np.radians(direction), spacing])[likely]
 
 
-def _peaks(
-    cover: Raster, nodes: Values, reach: float, slice_width: float, bin_width: float, min_cover: float
-) -> Values:
-    """Maxima (m, 5) of the profiles at nodes (n, 4): x, y, cover, direction (degrees), spacing (m)."""
-    origin, direction, spacing = nodes[:, :2], nodes[:, 2], nodes[:, 3]
-    half = int(np.ceil(reach * spacing.max() / bin_width))
+def _profiles(
+    cover: Raster, nodes: Values, extent: float, slice_width: float, bin_width: float
+) -> tuple[Values, Values]:
+    """Profiles D(v) (n, bins) across the rows at nodes (n, 4), and the bins' offsets v to the left in metres."""
+    origin, direction = nodes[:, :2], nodes[:, 2]
+    half = int(np.ceil(extent / bin_width))
     offsets = np.arange(-half, half + 1) * bin_width
-    along = np.linspace(-slice_width / 2, slice_width / 2, 5)
     tangent = np.column_stack([np.cos(direction), np.sin(direction)])
     normal = np.column_stack([-np.sin(direction), np.cos(direction)])
     profile = np.zeros((len(nodes), len(offsets)))
-    for t in along:
-        profile += sample(cover, (origin + t * tangent)[:, None] + offsets[:, None] * normal[:, None])
-    profile /= len(along)
+    for along in np.linspace(-slice_width / 2, slice_width / 2, SLICES):
+        profile += sample(cover, (origin + along * tangent)[:, None] + offsets[:, None] * normal[:, None])
+    return profile / SLICES, offsets
+
+
+def _maxima(profile: Values, offsets: Values, nodes: Values, reach: float, min_cover: float) -> Values:
+    """Maxima (m, 5) of the profiles: x, y, cover, direction (degrees), spacing (m)."""
     middle = profile[:, 1:-1]
     peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
-    peak &= np.abs(offsets[1:-1]) <= reach * spacing[:, None]
-    row, column = np.nonzero(peak)
-    left, top, right = profile[row, column], profile[row, column + 1], profile[row, column + 2]
+    peak &= np.abs(offsets[1:-1]) <= reach * nodes[:, 3:]
+    node, k = np.nonzero(peak)
+    left, top, right = profile[node, k], profile[node, k + 1], profile[node, k + 2]
     shift = 0.5 * (left - right) / np.minimum(left - 2 * top + right, -1e-9)
-    v = offsets[column + 1] + bin_width * np.clip(shift, -0.5, 0.5)
-    xy = central_points(origin[row], v, direction[row])
-    return np.column_stack([xy, top, np.degrees(direction[row]), spacing[row]])
+    v = offsets[k + 1] + (offsets[1] - offsets[0]) * np.clip(shift, -0.5, 0.5)
+    xy = central_points(nodes[node, :2], v, nodes[node, 2])
+    return np.column_stack([xy, top, np.degrees(nodes[node, 2]), nodes[node, 3]])

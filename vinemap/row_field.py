@@ -28,6 +28,8 @@ COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
+HARMONICS = (1, 2, 3)
+"""Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
 BATCH = 512
 
 
@@ -115,13 +117,13 @@ def estimate_row_field(
     -------
     RowField
         On a grid of 1 m over the cover's area. Likelihood is the share of the window's variance that the wave
-        carries; direction and spacing are NaN where it is zero.
+        and its harmonics carry; direction and spacing are NaN where it is zero.
     """
     base = _block_mean(cover, COVER_RESOLUTION)
     peaks = _scan(base.values, window, step, (min_spacing, max_spacing))
     peaks = _axial_median(peaks)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
-    return _resample(peaks, grid, base.grid, window, step, cover)
+    return _resample(peaks, grid, base.grid, step, cover)
 
 
 def _block_mean(raster: Raster, resolution: float) -> Raster:
@@ -143,12 +145,12 @@ def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) 
     stride = int(round(step / COVER_RESOLUTION))
     # Windows reach over the edge by half their width; what lies there is no canopy.
     my, mx = (n // stride + 2 for n in cover.shape)
-    padded = np.zeros([(m - 1) * stride + size for m in (my, mx)])
+    padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)
     half = size // 2
     padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover
     windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
     hann = np.hanning(size + 1)[:-1]
-    taper = hann[:, None] * hann
+    taper = (hann[:, None] * hann).astype(np.float32)
     occupied = np.flatnonzero([w.any() for w in windows])
     out = np.zeros((3, len(windows)))
     out[:2] = np.nan
@@ -169,7 +171,9 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     fx = np.arange(wide // 2 + 1)[None, :] / (wide * COVER_RESOLUTION)
     frequency = np.hypot(fy, fx)
     inside = (frequency >= 1 / band[1]) & (frequency <= 1 / band[0])
-    variance = power[:, frequency >= 1 / (1.5 * band[1])].sum(axis=1)
+    # A real signal's spectrum is symmetric: the half that is kept holds the column fx = 0 whole.
+    whole = np.where(fx == 0, 0.5, 1.0) * (frequency >= 1 / (1.5 * band[1]))
+    variance = np.einsum("kij,ij->k", power, whole)
     flat = np.where(inside, power, 0.0).reshape(len(power), -1)
     best = flat.argmax(axis=1)
     i, j = np.unravel_index(best, frequency.shape)
@@ -182,19 +186,26 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     dj = _vertex(left, log[k, i, j], log[k, i, np.minimum(j + 1, wide // 2)])
     unit = wide * COVER_RESOLUTION
     y, x = (i + di - wide // 2) / unit, (j + dj) / unit
-    lobe = np.zeros(len(power))
-    reach = 2 * PADDING
-    for a in range(-reach, reach + 1):
-        for b in range(-reach, reach + 1):
-            column = j + b
-            row = np.where(column < 0, wide - (i + a), i + a)
-            column = np.abs(column)
-            valid = (row >= 0) & (row < wide) & (column <= wide // 2)
-            lobe += np.where(valid, power[k, np.clip(row, 0, wide - 1), np.clip(column, 0, wide // 2)], 0.0)
-    strength = np.clip(lobe / np.maximum(variance, 1e-12), 0, 1)
+    waves = sum(_lobe(power, n * (i - wide // 2) + wide // 2, n * j) for n in HARMONICS)
+    strength = np.clip(waves / np.maximum(variance, 1e-12), 0, 1)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
     direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
     return np.stack([direction, 1 / np.hypot(x, y), strength])
+
+
+def _lobe(power: Values, i: NDArray[np.int64], j: NDArray[np.int64]) -> Values:
+    """Power (k,) of the main lobe around one bin (k,) of each spectrum; none beyond the spectrum's edge."""
+    n, half = power.shape[1], power.shape[2] - 1
+    k = np.arange(len(power))
+    total = np.zeros(len(power))
+    reach = 2 * PADDING
+    for a in range(-reach, reach + 1):
+        for b in range(-reach, reach + 1):
+            mirrored = j + b < 0
+            row, column = np.where(mirrored, n - (i + a), i + a), np.abs(j + b)
+            valid = (row >= 0) & (row < n) & (column <= half)
+            total += np.where(valid, power[k, np.clip(row, 0, n - 1), np.minimum(column, half)], 0.0)
+    return total
 
 
 def _vertex(left: Values, middle: Values, right: Values) -> Values:
@@ -224,7 +235,7 @@ def _axial_median(peaks: _Peaks) -> _Peaks:
     return _Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
 
 
-def _resample(peaks: _Peaks, grid: Grid, base: Grid, window: float, step: float, cover: Raster) -> RowField:
+def _resample(peaks: _Peaks, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:
     """Bring the waves of the windows to a raster, weighted by their strength."""
     x, y = grid.centres()
     i, j = np.meshgrid((base.north - y) / step, (x - base.west) / step, indexing="ij")

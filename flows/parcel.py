@@ -1,0 +1,88 @@
+"""One parcel of a configured survey as a Prefect flow: every stage of the chain is a task run.
+
+``python -m flows.parcel configs/barolo.yaml F``
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+
+from vinemap import paths
+from vinemap.cli import fail, progress
+from vinemap.config import SurveyConfig, choose_parcel, load_survey
+from vinemap.crs import parse_crs
+from vinemap.errors import InputError, VinemapError
+from vinemap.parcel import Summary, map_parcel
+from vinemap.synthetic import barolo, write_survey
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def as_tasks(show: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a ``step`` that runs each stage as a Prefect task; arrays are neither cached nor stored."""
+
+    def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        # Without parameters, as Prefect would walk through every array that it is given.
+        stage = task(lambda: function(*args, **kwargs), name=name, cache_policy=NO_CACHE, persist_result=False)
+        return show(name, stage)
+
+    return step
+
+
+@flow(name="parcel", flow_run_name="{survey}-{parcel}", persist_result=False, validate_parameters=False)
+def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
+    """Map one parcel of a survey."""
+    cloud = config.cloud or paths.survey_cloud(survey)
+    boundary = config.boundaries or paths.survey_boundaries(survey)
+    with progress(parcel) as show:
+        return map_parcel(
+            cloud,
+            paths.product_folder(survey, parcel),
+            parcel=parcel,
+            settings=config.settings,
+            boundary=boundary,
+            crs=parse_crs(config.crs) if config.crs else None,
+            origin=config.origin,
+            step=as_tasks(show),
+        )
+
+
+def ensure_cloud(config: SurveyConfig) -> None:
+    """Simulate the survey if it is an example that has not been made yet.
+
+    Raises
+    ------
+    InputError
+        If the cloud of a real survey is missing.
+    """
+    cloud = config.cloud or paths.survey_cloud(config.survey)
+    if cloud.is_file():
+        return
+    if config.simulate is None:
+        raise InputError(f"{cloud}: no such file: put the cloud of survey {config.survey} there, or name it as 'cloud'")
+    click.echo(f"Simulating the survey {config.survey} in {cloud.parent} (once)…", err=True)
+    write_survey(barolo(), cloud.parent)
+
+
+def main() -> None:
+    """Map the parcel named on the command line."""
+    try:
+        if len(sys.argv) != 3:
+            fail("give a survey's configuration and a parcel: python -m flows.parcel configs/barolo.yaml F")
+        config = load_survey(Path(sys.argv[1]))
+        parcel = choose_parcel(config, sys.argv[2])
+        ensure_cloud(config)
+        click.echo(parcel_flow(config.survey, parcel, config).line())
+    except VinemapError as error:
+        fail(error)
+
+
+if __name__ == "__main__":
+    main()

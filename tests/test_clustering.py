@@ -1,0 +1,104 @@
+"""Clusters of key points: the thesis's three cases, and rows that break, bend and come close."""
+
+import geopandas as gpd
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+
+from vinemap.clustering import cluster_rows, ellipse_graph
+
+
+def literal_clusters(xy, direction, along, across):
+    """Cases A, B and C as the thesis tells them, one key point after the other."""
+    cluster = np.full(len(xy), -1)
+    for j in range(len(xy)):
+        cos, sin = np.cos(direction[j]), np.sin(direction[j])
+        x, y = (xy - xy[j]) @ [cos, sin], (xy - xy[j]) @ [-sin, cos]
+        inside = (x / along[j]) ** 2 + (y / across[j]) ** 2 <= 1
+        touched = np.unique(cluster[inside & (cluster >= 0)])
+        oldest = touched.min() if len(touched) else cluster.max() + 1
+        cluster[np.isin(cluster, touched) & (cluster >= 0)] = oldest
+        cluster[inside] = oldest
+    return cluster
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_components_are_what_cases_a_b_c_leave(seed):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, 15, (150, 2))
+    direction = rng.normal(0.3, 0.1, 150)
+    along, across = rng.uniform(0.8, 1.5, 150), rng.uniform(0.2, 0.4, 150)
+    literal = literal_clusters(xy, direction, along, across)
+    found = connected_components(ellipse_graph(xy, direction, along=along, across=across), directed=False)[1]
+    order = rng.permutation(150)
+    again = literal_clusters(xy[order], direction[order], along[order], across[order])
+    pairs = {(a, b) for a, b in zip(literal, found, strict=True)}
+    assert len(pairs) == len(set(literal)) == len(set(found))
+    assert len(set(zip(again, found[order], strict=True))) == len(set(found))
+
+
+def key_points(rows, spacing=2.5, noise=0.03, seed=0):
+    """Key points every 0.1 m on lines (n, 2), with the row they came from."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for k, line in enumerate(rows):
+        way = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        at = np.arange(0, way[-1], 0.1)
+        xy = np.column_stack([np.interp(at, way, line[:, c]) for c in (0, 1)])
+        tangent = np.gradient(xy, axis=0)
+        angle = np.degrees(np.arctan2(tangent[:, 1], tangent[:, 0])) % 180
+        parts.append(np.column_stack([xy + rng.normal(0, noise, xy.shape), angle, np.full(len(xy), k)]))
+    data = np.concatenate(parts)
+    data = data[rng.permutation(len(data))]
+    return gpd.GeoDataFrame(
+        {"direction_deg": data[:, 2], "spacing_m": spacing, "truth": data[:, 3].astype(int)},
+        geometry=gpd.points_from_xy(data[:, 0], data[:, 1]),
+        crs=32632,
+    )
+
+
+def assert_rows_are_kept_apart(found, n):
+    assert len(found.groupby(["truth", "cluster"])) == n
+    assert found["cluster"].nunique() == n
+
+
+def test_straight_rows():
+    rows = [np.array([[0, 2.5 * k], [40, 2.5 * k + 8]]) for k in range(6)]
+    assert_rows_are_kept_apart(cluster_rows(key_points(rows)), 6)
+
+
+def test_gaps_are_bridged_on_straight_and_curved_rows():
+    angle = np.linspace(0, 1.2, 200)
+    rows = [np.column_stack([(40 + 2.5 * k) * np.cos(angle), (40 + 2.5 * k) * np.sin(angle)]) for k in range(5)]
+    points = key_points(rows)
+    bearing = np.arctan2(points.geometry.y, points.geometry.x)
+    row = points["truth"]
+    holes = [(1, 0.3, 0.45), (2, 0.5, 0.8), (3, 0.2, 0.3), (3, 0.6, 0.7)]
+    for k, low, high in holes:
+        points = points[~((row == k) & (bearing > low) & (bearing < high))]
+        row, bearing = points["truth"], bearing[points.index]
+    found = cluster_rows(points.reset_index(drop=True))
+    assert_rows_are_kept_apart(found, 5)
+    assert cluster_rows(points.reset_index(drop=True), max_gap=0)["cluster"].nunique() == 9
+
+
+def test_rows_that_come_close_stay_two():
+    """Table 2.1's row 15 starts 1.5 m from row 14."""
+    rows = [
+        np.array([[0, 0], [30, 0], [50, -0.5], [110, 0]]),
+        np.array([[32, 1.35], [70, 2.5], [110, 2.5]]),
+        np.array([[0, -2.5], [110, -2.5]]),
+    ]
+    assert_rows_are_kept_apart(cluster_rows(key_points(rows)), 3)
+
+
+def test_small_clutter_is_dropped():
+    rows = [np.array([[0, 0], [20, 0]]), np.array([[3, 1.2], [3.3, 1.2]])]
+    found = cluster_rows(key_points(rows), min_points=6)
+    assert set(found["truth"]) == {0}
+
+
+def test_no_key_points():
+    found = cluster_rows(key_points([np.array([[0, 0], [5.0, 0]])]).iloc[:0])
+    assert len(found) == 0
+    assert "cluster" in found.columns

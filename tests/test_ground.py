@@ -1,0 +1,72 @@
+"""Terrain against known truth."""
+
+import numpy as np
+import pytest
+
+from vinemap.cloud import PointCloud
+from vinemap.crs import parse_crs
+from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
+from vinemap.raster import sample
+from vinemap.synthetic import Obstacle, Vineyard, hillside, rows_of, simulate, terraced
+
+UTM = parse_crs("EPSG:32632")
+
+
+def errors(survey):
+    """Errors of the terrain model in metres, inside the parcel."""
+    dtm = terrain_model(PointCloud(survey.xyz, UTM))
+    west, south, east, north = survey.parcels.total_bounds
+    x, y = np.random.default_rng(0).uniform([west + 2, south + 2], [east - 2, north - 2], (3000, 2)).T
+    return sample(dtm, np.column_stack([x, y])) - survey.terrain(x, y)
+
+
+@pytest.mark.parametrize(("slope", "median", "most"), [(0.1, 0.02, 0.06), (0.45, 0.04, 0.09)])
+def test_slopes(slope, median, most):
+    rows = rows_of(8, length=25, spacing=2.2, azimuth=20)
+    error = np.abs(errors(simulate([Vineyard("A", rows)], hillside(slope), seed=1)))
+    assert np.median(error) < median
+    assert np.quantile(error, 0.95) < most
+
+
+def test_terraces():
+    rows = rows_of(8, length=25, spacing=1.8)
+    terrain = terraced(hillside(0.4), rows, spacing=1.8, riser=0.6)
+    error = np.abs(errors(simulate([Vineyard("A", rows)], terrain, seed=1)))
+    assert np.median(error) < 0.05
+    assert np.quantile(error, 0.95) < 0.25
+
+
+def test_trees_houses_weeds_and_floaters():
+    rows = rows_of(6, length=25)
+    x, y = rows[0].mean(axis=0)
+    things = [Obstacle(x - 5, y - 4, 2.0, 2.0, 6.0, 1.0), Obstacle(x + 5, y - 4, 2.0, 1.5, 3.0, solid=True)]
+    survey = simulate([Vineyard("A", rows)], hillside(0.2), obstacles=things, weeds=0.4, floaters=0.005, seed=2)
+    error = np.abs(errors(survey))
+    assert np.median(error) < 0.02
+    assert np.quantile(error, 0.95) < 0.1
+
+
+def test_closed_canopy():
+    """Rows so near and wide that little soil is seen between them."""
+    rows = rows_of(10, length=20, spacing=1.5)
+    survey = simulate([Vineyard("A", rows, half_width=0.5, leafiness=20)], hillside(0.3), seed=4)
+    error = np.abs(errors(survey))
+    assert np.median(error) < 0.05
+    assert np.quantile(error, 0.95) < 0.15
+
+
+def test_heights_and_canopy_height_model(vineyard, cloud):
+    dtm = terrain_model(cloud)
+    heights = height_above_ground(cloud, dtm)
+    truth = cloud.xyz[:, 2] - vineyard.terrain(cloud.xyz[:, 0], cloud.xyz[:, 1])
+    assert np.median(np.abs(heights - truth)) < 0.02
+    chm = canopy_height_model(cloud, heights)
+    assert np.nanquantile(chm.values, 0.99) == pytest.approx(vineyard.rows["mean_height"].mean(), abs=0.3)
+    assert np.nanmin(chm.values) == 0
+
+
+def test_a_handful_of_points():
+    xyz = np.array([[0.0, 0, 5], [1, 0, 5.2], [0, 1, 5.1]])
+    dtm = terrain_model(PointCloud(xyz, UTM))
+    assert np.isfinite(dtm.values).all()
+    assert np.abs(dtm.values - 5.1).max() < 1

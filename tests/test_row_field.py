@@ -1,0 +1,84 @@
+"""Row field against waves and vineyards of known direction and spacing."""
+
+import numpy as np
+import pytest
+from pyproj import CRS
+
+from vinemap.cloud import PointCloud
+from vinemap.crs import parse_crs
+from vinemap.ground import height_above_ground, terrain_model
+from vinemap.raster import Grid, Raster, grid_over
+from vinemap.row_field import canopy_cover, estimate_row_field
+from vinemap.synthetic import Obstacle, Vineyard, hillside, rows_of, simulate
+
+UTM = CRS.from_epsg(32632)
+
+
+def stripes(direction, spacing, size=60.0, width=0.5):
+    """Cover of straight rows, a raster of 0.1 m."""
+    n = int(size / 0.1)
+    grid = Grid(1000.0, 1000.0 + size, 0.1, n, n)
+    x, y = np.meshgrid(*grid.centres())
+    across = -(x - 1000) * np.sin(np.radians(direction)) + (y - 1000) * np.cos(np.radians(direction))
+    phase = (across / spacing + 0.5) % 1 - 0.5
+    return Raster((np.abs(phase) * spacing < width / 2).astype(float), grid, UTM)
+
+
+def axial(a, b):
+    """Smallest angle in degrees between directions."""
+    return np.abs((np.asarray(a) - b + 90) % 180 - 90)
+
+
+@pytest.mark.parametrize("direction", [0, 16, 45, 89.5, 90, 137, 179])
+@pytest.mark.parametrize("spacing", [1.8, 2.5, 3.5])
+def test_direction_and_spacing_of_stripes(direction, spacing):
+    field = estimate_row_field(stripes(direction, spacing))
+    middle = (slice(12, -12), slice(12, -12))
+    assert axial(field.direction.values[middle], direction).max() < 0.5
+    assert np.abs(field.spacing.values[middle] / spacing - 1).max() < 0.02
+    assert field.likelihood.values[middle].min() > 0.4
+
+
+def test_nothing_is_no_vineyard():
+    cover = stripes(0, 2.5)
+    field = estimate_row_field(Raster(np.zeros_like(cover.values), cover.grid, UTM))
+    assert np.isnan(field.direction.values).all()
+    assert field.likelihood.values.max() == 0
+
+
+def test_curved_rows_on_a_slope():
+    rows = rows_of(10, length=60, radius=40)
+    survey = simulate([Vineyard("A", rows, dead=0.1)], hillside(0.2), seed=5)
+    cloud = PointCloud(survey.xyz, parse_crs("EPSG:32632"))
+    cover = canopy_cover(cloud, height_above_ground(cloud, terrain_model(cloud)))
+    field = estimate_row_field(cover)
+    truth, places = [], []
+    for row in rows[1:-1]:
+        step = np.diff(row, axis=0)
+        truth.append(np.degrees(np.arctan2(step[:, 1], step[:, 0])))
+        places.append((row[1:] + row[:-1]) / 2)
+    truth, places = np.concatenate(truth), np.concatenate(places)
+    grid = field.direction.grid
+    i = ((grid.north - places[:, 1]) / grid.resolution).astype(int)
+    j = ((places[:, 0] - grid.west) / grid.resolution).astype(int)
+    error = axial(field.direction.values[i, j], truth)
+    assert np.median(error) < 1.0
+    assert np.quantile(error, 0.95) < 4
+    assert np.median(field.spacing.values[i, j]) == pytest.approx(2.5, rel=0.03)
+
+
+def test_cover_does_not_follow_density_and_leaves_trees_out(vineyard, cloud):
+    heights = height_above_ground(cloud, terrain_model(cloud))
+    half = np.random.default_rng(0).random(len(heights)) < 0.5
+    dense = canopy_cover(cloud, heights, smoothing=0.2)
+    sparse = canopy_cover(PointCloud(cloud.xyz[half], cloud.crs), heights[half], smoothing=0.2)
+    assert np.abs(dense.values.mean() - sparse.values.mean()) < 0.05 * dense.values.mean()
+
+    rows = rows_of(1, length=20)
+    x, y = rows[0].mean(axis=0) + [0, 6]
+    survey = simulate([Vineyard("A", rows)], hillside(0.1), obstacles=[Obstacle(x, y, 2.0, 2.0, 6.0, 1.0)], seed=1)
+    tree = PointCloud(survey.xyz, cloud.crs)
+    cover = canopy_cover(tree, height_above_ground(tree, terrain_model(tree)))
+    grid = grid_over(tree.xyz, resolution=0.1)
+    gx, gy = np.meshgrid(*grid.centres())
+    assert cover.values[np.hypot(gx - x, gy - y) < 1.5].max() < 0.05

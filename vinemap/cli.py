@@ -1,0 +1,129 @@
+"""Commands of vinemap. Heavy modules are imported where a command needs them, so that ``--help`` is at once."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vinemap import __version__
+from vinemap.errors import VinemapError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+FILE = click.Path(path_type=Path)
+
+
+class _Origin(click.ParamType):
+    name = "LAT,LON,ALT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
+        from vinemap.crs import Origin  # noqa: PLC0415
+
+        try:
+            lat, lon, alt = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx)
+        if not (-90 <= lat <= 90 and -180 <= lon <= 180):
+            self.fail(f"{value!r} lies on no globe: latitude comes first, in degrees", param, ctx)
+        return Origin(lat, lon, alt)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="vinemap")
+def commands() -> None:
+    """Vine rows and light canopy meshes from UAV point clouds."""
+
+
+@commands.command()
+@click.argument("cloud", type=FILE)
+@click.option("--boundary", type=FILE, help="Polygon to clip to: GeoPackage, GeoJSON or Shapefile, in any CRS.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none or a wrong one.")
+@click.option("--parcel", help="Name of the parcel; the cloud's by default.")
+@click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
+@click.option("--origin", type=_Origin(), help="Origin of the local frame {Main}; the parcel's corner by default.")
+@click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+def run(
+    cloud: Path,
+    boundary: Path | None,
+    crs: str | None,
+    parcel: str | None,
+    out: Path | None,
+    origin: Any,  # noqa: ANN401
+    settings: Path | None,
+) -> None:
+    """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
+    from vinemap import paths  # noqa: PLC0415
+    from vinemap.config import check_name, load_settings  # noqa: PLC0415
+    from vinemap.crs import parse_crs  # noqa: PLC0415
+
+    name = check_name(parcel if parcel is not None else paths.stem(cloud))
+    folder = out or paths.product_folder(paths.stem(cloud), name)
+    options = {
+        "crs": parse_crs(crs) if crs else None,
+        "settings": load_settings(settings) if settings else None,
+        "boundary": boundary,
+        "origin": origin,
+    }
+    with progress(name) as step:
+        from vinemap.parcel import map_parcel  # noqa: PLC0415
+
+        summary = map_parcel(cloud, folder, parcel=name, step=step, **options)
+    click.echo(summary.line())
+
+
+@commands.command()
+@click.argument("result", type=FILE)
+@click.argument("reference", type=FILE)
+def evaluate(result: Path, reference: Path) -> None:
+    """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
+    from vinemap.evaluate import evaluate_rows, format_table, read_lines  # noqa: PLC0415
+
+    click.echo(format_table(evaluate_rows(read_lines(result), read_lines(reference))))
+
+
+@contextmanager
+def progress(parcel: str) -> Iterator[Callable[..., Any]]:
+    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+
+    columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("Starting", total=None, parcel=parcel)
+
+        def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+            from vinemap.parcel import STAGES  # noqa: PLC0415
+
+            bar.update(task, description=name, total=len(STAGES), completed=STAGES.index(name))
+            return function(*args, **kwargs)
+
+        yield step
+
+
+def main() -> None:
+    """Run a command; what is wrong with its input is said in one line, with exit code 2."""
+    try:
+        commands.main(prog_name="vinemap", standalone_mode=False)
+    except VinemapError as error:
+        fail(error)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except click.ClickException as error:
+        fail(error.format_message())
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def fail(reason: object) -> None:
+    """Say a reason in one line on stderr and exit with code 2."""
+    click.echo(f"vinemap: {' '.join(str(reason).split())}", err=True)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

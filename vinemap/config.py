@@ -1,0 +1,245 @@
+"""Configuration: one flat model a stage, the settings of a parcel, and the survey that a YAML file describes."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vinemap.crs import Origin
+from vinemap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+Metres = Annotated[float, Field(gt=0, le=100)]
+M = TypeVar("M", bound="Options")
+Share = Annotated[float, Field(ge=0, le=1)]
+
+NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+"""Names of surveys and parcels: they become names of files and folders."""
+
+
+class Options(BaseModel):
+    """Strict options: unknown keys are errors, and nothing changes after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class GroundOptions(Options):
+    """Terrain model."""
+
+    resolution: float = Field(0.25, ge=0.05, le=2, description="cell size of the DTM (m)")
+    quantile: float = Field(0.1, gt=0, le=0.5, description="order of the height that stands for a cell's terrain")
+    tolerance: Metres = Field(0.12, description="height above the surface around it at which a cell is terrain (m)")
+    terrace_height: float = Field(1.0, ge=0, le=5, description="height up to which a thin layer is a terrace (m)")
+
+
+class CoverOptions(Options):
+    """Raster of canopy cover."""
+
+    resolution: float = Field(0.1, ge=0.02, le=0.5, description="cell size (m)")
+    low: Metres = Field(0.5, description="height above ground at which canopy begins (m)")
+    high: Metres = Field(2.9, description="height above ground at which it ends (m)")
+    smoothing: float | None = Field(None, gt=0, le=1, description="Gaussian (m); none: the mean point distance")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> CoverOptions:
+        if self.low >= self.high:
+            raise ValueError(f"low ({self.low}) must be below high ({self.high})")
+        return self
+
+
+class RowFieldOptions(Options):
+    """Direction, spacing and likelihood of rows."""
+
+    window: float = Field(16.0, ge=6, le=60, description="width of the spectrum's windows (m)")
+    step: float = Field(2.0, ge=0.5, le=20, description="distance of the windows (m)")
+    min_spacing: float = Field(1.2, ge=0.8, le=10, description="smallest inter-row spacing (m)")
+    max_spacing: float = Field(4.5, ge=0.8, le=10, description="largest inter-row spacing (m)")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RowFieldOptions:
+        if self.min_spacing >= self.max_spacing:
+            raise ValueError(f"min_spacing ({self.min_spacing}) must be below max_spacing ({self.max_spacing})")
+        return self
+
+
+class KeyPointOptions(Options):
+    """Key points of the canopy."""
+
+    grid_step: float = Field(0.5, ge=0.1, le=5, description="distance of the nodes (m)")
+    reach: float = Field(0.6, ge=0.5, le=5, description="reach of a profile to both sides (spacings)")
+    slice_width: Metres = Field(0.5, description="width of a slice along the rows (m)")
+    bin_width: float = Field(0.05, ge=0.01, le=0.5, description="bins of a profile (m)")
+    smoothing: float = Field(0.15, gt=0, le=1, description="Gaussian along a profile (m)")
+    min_cover: Share = Field(0.12, description="cover of a maximum")
+    min_likelihood: Share = Field(0.1, description="vineyard likelihood of a node")
+
+
+class ClusteringOptions(Options):
+    """Clusters of key points."""
+
+    along: float = Field(1.0, gt=0, le=10, description="semi-axis of the ellipse along the row (spacings)")
+    across: float = Field(0.12, gt=0, le=2, description="semi-axis across the row (spacings)")
+    min_points: int = Field(6, ge=1, description="key points of a piece")
+    max_gap: float = Field(20.0, ge=0, le=100, description="missing vines that a row bridges (m)")
+
+
+class CurveOptions(Options):
+    """Curves, ends and gaps of rows."""
+
+    threshold: Metres = Field(2.0, description="distance t of the enhanced key points (m)")
+    smoothing: Metres = Field(3.0, description="wavelength below which bends are noise (m)")
+    end_share: float = Field(0.5, gt=0, lt=1, description="share of the median cover at which canopy ends")
+    min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
+    min_length: Metres = Field(4.0, description="length of a row (m)")
+    min_radius: Metres = Field(8.0, description="radius of the tightest bend (m)")
+    max_width: Metres = Field(1.6, description="width of a row's canopy (m)")
+    min_support: Share = Field(0.25, description="share of a row's length that has canopy")
+
+
+class SectionOptions(Options):
+    """Sections across the rows."""
+
+    width: float = Field(0.4, ge=0.05, le=2, description="extent a along the row (m)")
+    step: float = Field(0.25, ge=0.05, le=5, description="distance b along the row (m)")
+
+
+class CanopyOptions(Options):
+    """Canopy told from terrain."""
+
+    margin: float = Field(0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins (m)")
+    half_width: Metres = Field(0.9, description="distance from γ at which canopy ends (m)")
+    max_height: Metres = Field(2.9, description="height above terrain at which canopy ends (m)")
+    min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
+    min_points: int = Field(8, ge=3, description="canopy points of a section")
+    min_share: Share = Field(0.15, description="share of the median section's points that a section has")
+    min_height: float = Field(0.8, ge=0, le=5, description="90% height of a section (m)")
+
+
+class PolygonOptions(Options):
+    """Minimum-area polygons."""
+
+    c: int = Field(7, ge=5, le=30, description="vertices of a section's polygon")
+    share: Share = Field(0.02, description="share of a section's points that is peeled off")
+
+
+class Settings(Options):
+    """Settings of every stage."""
+
+    ground: GroundOptions = GroundOptions()
+    cover: CoverOptions = CoverOptions()
+    row_field: RowFieldOptions = RowFieldOptions()
+    key_points: KeyPointOptions = KeyPointOptions()
+    clustering: ClusteringOptions = ClusteringOptions()
+    curves: CurveOptions = CurveOptions()
+    sections: SectionOptions = SectionOptions()
+    canopy: CanopyOptions = CanopyOptions()
+    polygon: PolygonOptions = PolygonOptions()
+
+
+class SurveyConfig(Options):
+    """A survey: its cloud, its parcels and the settings for all of them."""
+
+    survey: str = Field(description="name; its data lie in data/surveys/<survey>")
+    cloud: Path | None = Field(None, description="LAS, LAZ or COPC file; data/surveys/<survey>/<survey>.laz by default")
+    boundaries: Path | None = Field(None, description="polygons of the parcels, named in any of their columns")
+    parcels: list[str] = Field(min_length=1, description="names of the parcels")
+    crs: str | None = Field(None, description="CRS of the cloud where the file states none")
+    origin: Origin | None = Field(None, description="origin of {Main}: latitude, longitude (degrees), altitude (m)")
+    simulate: str | None = Field(None, pattern="^barolo$", description="example to simulate where the cloud is missing")
+    settings: Settings = Settings()
+
+    @model_validator(mode="after")
+    def _names(self) -> SurveyConfig:
+        for name in (self.survey, *self.parcels):
+            check_name(name)
+        return self
+
+
+def check_name(name: str) -> str:
+    """Return the name of a parcel or survey if it can be the name of a file.
+
+    Raises
+    ------
+    ConfigError
+        If it is empty, too long, or has characters of paths.
+    """
+    if not NAME.fullmatch(name) or name.endswith((".", " ")):
+        raise ConfigError(
+            f"name {name!r} can't name a file: use letters, digits, spaces, '-', '_' and '.', a letter or digit first"
+        )
+    return name
+
+
+def choose_parcel(config: SurveyConfig, name: str) -> str:
+    """Return the parcel's name as configured.
+
+    Raises
+    ------
+    ConfigError
+        If the configuration doesn't know it; names the nearest that it does.
+    """
+    check_name(name)
+    if name in config.parcels:
+        return name
+    raise ConfigError(f"survey {config.survey} has no parcel {name!r}: {_nearest(name, config.parcels)}")
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    lower = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(word.lower(), list(lower), n=1, cutoff=0.5)
+    return f"did you mean {lower[close[0]]!r}?" if close else f"known are {', '.join(known)}"
+
+
+def load_survey(path: Path) -> SurveyConfig:
+    """Read a survey's YAML file; ConfigError names the key, its value and what it may be."""
+    return _validated(SurveyConfig, _read_yaml(path), path)
+
+
+def load_settings(path: Path) -> Settings:
+    """Read a YAML file with settings of stages; ConfigError names the key, its value and what it may be."""
+    return _validated(Settings, _read_yaml(path), path)
+
+
+def _read_yaml(path: Path) -> Any:  # noqa: ANN401
+    if not path.is_file():
+        folder = path.parent if path.parent.is_dir() else Path()
+        known = [str(p) for p in sorted(folder.glob("*.yaml"))]
+        raise ConfigError(f"{path}: no such file" + (f": {_nearest(str(path), known)}" if known else ""))
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path}: no valid YAML ({reason})") from error
+
+
+def _validated(model: type[M], data: Any, path: Path) -> M:  # noqa: ANN401
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {'; '.join(_explain(e, model) for e in error.errors())}") from error
+
+
+def _explain(error: ErrorDetails, model: type[Options]) -> str:
+    place = ".".join(str(part) for part in error["loc"]) or "the file"
+    if error["type"] == "extra_forbidden":
+        keys = list(_model_at(model, error["loc"][:-1]).model_fields)
+        return f"unknown key {place}: {_nearest(str(error['loc'][-1]), keys)}"
+    if error["type"] == "missing":
+        return f"{place} is missing"
+    message = error["msg"].removeprefix("Value error, ")
+    return f"{place} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def _model_at(model: type[Options], loc: tuple[int | str, ...]) -> type[Options]:
+    for part in loc:
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        candidates = [annotation, *get_args(annotation)]
+        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, Options)), model)
+    return model

@@ -1,0 +1,115 @@
+"""Names of files: the only place where one is written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinemap.errors import OutputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+DATA = Path("data")
+RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
+RUN = "run.json"
+
+
+def survey_cloud(survey: str) -> Path:
+    """Cloud of a survey."""
+    return DATA / "surveys" / survey / f"{survey}.laz"
+
+
+def survey_boundaries(survey: str) -> Path:
+    """Polygons of a survey's parcels."""
+    return DATA / "surveys" / survey / "parcels.gpkg"
+
+
+def product_folder(survey: str, parcel: str) -> Path:
+    """Folder of a parcel's product."""
+    return DATA / "products" / survey / parcel
+
+
+def geopackage(folder: Path, parcel: str) -> Path:
+    """GeoPackage of a product."""
+    return folder / f"{parcel}.gpkg"
+
+
+def raster(folder: Path, parcel: str, kind: str) -> Path:
+    """One of the rasters of a product (``RASTERS``)."""
+    return folder / f"{parcel}_{kind}.tif"
+
+
+def canopy_mesh(folder: Path, parcel: str) -> Path:
+    """glTF of a product."""
+    return folder / f"{parcel}_canopy.glb"
+
+
+def run_record(folder: Path) -> Path:
+    """Record of the run that made a product."""
+    return folder / RUN
+
+
+@contextmanager
+def product(target: Path) -> Iterator[Path]:
+    """Give a folder beside ``target`` to write a product into, and put it in place if all went well.
+
+    A folder that is missing, empty or holds an earlier product is replaced whole. In one that holds other files, the
+    product's replace those of the same name and the others stay.
+
+    Raises
+    ------
+    OutputError
+        If nothing can be written there.
+    """
+    draft = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        draft.mkdir()
+        if target.exists() and not target.is_dir():
+            raise NotADirectoryError(20, "is a file")
+    except OSError as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise _unwritable(target, error) from error
+    try:
+        yield draft
+        _publish(draft, target)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _unwritable(target: Path, error: OSError) -> OutputError:
+    return OutputError(f"{target}: can't be written ({error.strerror or error}): choose another folder with --out")
+
+
+def _publish(draft: Path, target: Path) -> None:
+    if not target.exists():
+        draft.rename(target)
+    elif _replaceable(target, draft):
+        old = draft.with_suffix(".old")
+        target.rename(old)
+        draft.rename(target)
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        run_record(target).unlink(missing_ok=True)
+        for path in sorted(draft.iterdir(), key=lambda p: p.name == RUN):
+            os.replace(path, target / path.name)
+
+
+def _replaceable(target: Path, draft: Path) -> bool:
+    """Whether a folder holds nothing, or nothing but an earlier product of the same parcel."""
+    names = {p.name for p in target.iterdir()}
+    if not names:
+        return True
+    try:
+        old, new = (json.loads(run_record(folder).read_text(encoding="utf-8")) for folder in (target, draft))
+        return bool(old["parcel"] == new["parcel"] and names <= {*old["files"], RUN})
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -1,0 +1,130 @@
+"""Vector layers: what a product's GeoPackage holds, reading boundaries, and writing it with its styles."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pyogrio
+import shapely
+
+from vinemap.errors import InputError
+from vinemap.style import layer_styles
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from pyproj import CRS
+
+TEXT, WHOLE, REAL = "str", "int64", "float64"
+
+
+class Layer(NamedTuple):
+    """Contract of a layer: OGR geometry type, columns in order with their dtype, what it holds."""
+
+    geometry: str
+    columns: dict[str, str]
+    description: str
+
+
+_END = ("x", "y", "z"), ("lat", "lon", "alt")
+_ROW = {"row_id": WHOLE, "label": TEXT}
+
+LAYERS: dict[str, Layer] = {
+    "rows": Layer(
+        "LineString Z",
+        _ROW
+        | dict.fromkeys(("length_m", "orientation_deg", "elevation_m", "elevation_diff_m"), REAL)
+        | {"n_key_points": WHOLE}
+        | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
+        | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL),
+        "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
+    ),
+    "row_ends": Layer("Point Z", _ROW | {"end": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
+    "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
+    "sections": Layer(
+        "LineString Z",
+        _ROW
+        | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL)
+        | {"n_points": WHOLE},
+        "Sections across the canopy",
+    ),
+    "gaps": Layer(
+        "LineString Z", _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL), "Stretches of rows without canopy"
+    ),
+    "parcel": Layer(
+        "Polygon",
+        {"parcel": TEXT, "n_rows": WHOLE}
+        | dict.fromkeys(("rows_length_m", "area_m2", "spacing_m", "orientation_deg", "gap_m"), REAL)
+        | {"vertical_datum": TEXT},
+        "The parcel",
+    ),
+}
+
+
+def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
+    """Bring a table to a layer's columns, in order and with their types.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing.
+    """
+    columns = LAYERS[layer].columns
+    missing = sorted(set(columns) - set(frame.columns))
+    if missing:
+        raise ValueError(f"layer {layer} lacks {', '.join(missing)}")
+    return frame[[*columns, "geometry"]].astype(columns)
+
+
+def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
+    """Write all layers of the contract, and the styles that QGIS applies by itself."""
+    for name, layer in LAYERS.items():
+        with warnings.catch_warnings():
+            # An empty column of text has no type of its own to infer.
+            warnings.simplefilter("ignore", UserWarning)
+            pyogrio.write_dataframe(
+                conform(layers[name], name),
+                path,
+                layer=name,
+                driver="GPKG",
+                geometry_type=layer.geometry,
+                dataset_options={"VERSION": "1.2"},
+                layer_options={"GEOMETRY_NAME": "geom", "DESCRIPTION": layer.description},
+                append=path.exists(),
+            )
+    styles = layer_styles({name: layer.columns for name, layer in LAYERS.items()})
+    pyogrio.write_dataframe(styles, path, layer="layer_styles", driver="GPKG", append=True)
+
+
+def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geometry, CRS]:
+    """Read the polygon of a parcel from GeoPackage, GeoJSON or Shapefile.
+
+    Of several polygons, those count in which a column holds the parcel's name; where none does, all do.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, or has no polygon or no CRS.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: no such file")
+    try:
+        frame = gpd.read_file(path)
+    except Exception as error:  # GDAL's errors come in several classes
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON or Shapefile ({reason})") from error
+    if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
+        raise InputError(f"{path}: has no geometry or no CRS: save the polygons with their CRS")
+    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
+    if len(frame) == 0:
+        raise InputError(f"{path}: holds no polygon")
+    named = frame[(frame.drop(columns="geometry").astype(str) == parcel).any(axis=1)]
+    chosen = named if len(named) else frame
+    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(chosen.geometry.to_numpy())))
+    if not np.isfinite(polygon.bounds).all():
+        raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
+    return shapely.force_2d(polygon), frame.crs
