@@ -30,7 +30,7 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     """Give rows their direction and number, and gaps the number of their row.
 
     A curve starts at its western end e1 (its southern one where it runs due north). Rows are numbered from 1 across
-    the rows, from south to north, from west to east where they run north–south; rows of one block (neighbours of
+    the rows, from south to north, from west to east where they run rather north–south; rows of one block (neighbours of
     about one direction) follow each other, blocks from west to east.
 
     Parameters
@@ -86,8 +86,9 @@ def _order_across(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
         members = block == b
         half = np.angle(np.exp(2j * angle[members]).mean()) / 2
         normal = np.array([-np.sin(half), np.cos(half)])
-        # North where rows run west–east, east where they run north–south.
-        normal = normal if (normal[1] > 0.05 or (abs(normal[1]) <= 0.05 and normal[0] > 0)) else -normal
+        # Northwards across rows that run rather west–east, eastwards across those that run rather north–south.
+        leading = normal[1] if abs(normal[1]) >= abs(normal[0]) else normal[0]
+        normal = normal if leading > 0 else -normal
         across[members] = middle[members] @ normal
         west[members] = middle[members, 0].mean()
     order: NDArray[np.int64] = np.lexsort((across, west))

@@ -1,0 +1,141 @@
+"""Sections along rows, and canopy told from terrain in them."""
+
+import geopandas as gpd
+import numpy as np
+import pytest
+import shapely
+from pyproj import CRS
+
+from vinemap.canopy import find_feet, measure_sections, quantile_of, separate_canopy, summarise_rows
+from vinemap.cloud import PointCloud, Sections
+from vinemap.ground import height_above_ground, terrain_model
+from vinemap.raster import Grid, Raster
+from vinemap.sections import cut_sections
+
+UTM = CRS.from_epsg(32632)
+
+
+def rows_frame(lines, spacing=2.5):
+    geometry = [shapely.LineString(np.column_stack([c, np.zeros(len(c))])) for c in lines]
+    return gpd.GeoDataFrame({"row_id": np.arange(1, len(lines) + 1), "spacing_m": spacing}, geometry=geometry, crs=UTM)
+
+
+def gaps_frame(*gaps):
+    row, start, end = zip(*gaps, strict=True) if gaps else ((), (), ())
+    columns = {"row_id": np.array(row, int), "start_m": np.array(start, float), "end_m": np.array(end, float)}
+    return gpd.GeoDataFrame(columns, geometry=[None] * len(gaps), crs=UTM)
+
+
+def flat(west, south, size=60.0, level=0.0):
+    return Raster(np.full((2, 2), level), Grid(west, south + size, size / 2, 2, 2), UTM)
+
+
+def test_every_section_holds_the_points_around_its_station():
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 1, 300)
+    line = np.column_stack([30 * np.sin(t), 30 - 30 * np.cos(t)])
+    xyz = np.column_stack([rng.uniform(-3, 30, 40000), rng.uniform(-3, 20, 40000), rng.uniform(0, 2, 40000)])
+    rows = rows_frame([line])
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5), width=0.4, step=0.25)
+    length = rows.length.iloc[0]
+    assert len(sections.row_id) == round(length / 0.25) + 1
+    assert sections.position[[0, -1]] == pytest.approx([0, length])
+    assert np.allclose(np.diff(sections.position), 0.25, atol=0.002)
+    # The rings between radius 30 ± 1.25, cut into wedges: along and across from their definition.
+    radius = np.hypot(xyz[:, 0], xyz[:, 1] - 30)
+    along = 30 * np.arctan2(xyz[:, 0], 30 - xyz[:, 1])
+    for k in (0, 10, 57, len(sections.row_id) - 1):
+        members = (np.abs(along - sections.position[k]) <= 0.2) & (np.abs(radius - 30) <= 1.25)
+        found = sections.points[sections.start[k] : sections.start[k + 1]]
+        assert len(found) == pytest.approx(members.sum(), abs=0.06 * members.sum() + 2)
+        assert np.sort(found[:, 0]).mean() == pytest.approx((30 - radius[members]).mean(), abs=0.06)
+
+
+def test_sections_leave_gaps_out():
+    line = np.array([[0, 0], [20.0, 0]])
+    xyz = np.random.default_rng(0).uniform([-1, -1, 0], [21, 1, 2], (5000, 3))
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame([line]), gaps_frame((1, 5.0, 9.0)), flat(-5, -5))
+    assert not ((sections.position > 5) & (sections.position < 9)).any()
+    assert sections.position.max() == 20
+
+
+def test_points_go_to_the_nearest_row():
+    lines = [np.array([[0, 0], [10.0, 0]]), np.array([[0, 2.0], [10.0, 2.0]])]
+    xyz = np.random.default_rng(0).uniform([0, -1, 0], [10, 3, 2], (8000, 3))
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame(lines, 3.0), gaps_frame(), flat(-5, -5))
+    y = sections.points[:, 0] + sections.origin[sections.section, 1]
+    assert (y[sections.row_id[sections.section] == 1] <= 1.13).all()
+    assert (y[sections.row_id[sections.section] == 2] >= 0.87).all()
+
+
+def test_no_rows_no_sections():
+    xyz = np.zeros((5, 3))
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame([]), gaps_frame(), flat(-5, -5))
+    canopy, feet = find_feet(separate_canopy(sections))
+    table = measure_sections(canopy, np.empty((0, 7, 2)), np.empty(0), crs=UTM)
+    assert len(table) == len(feet) == 0
+    assert len(summarise_rows(rows_frame([]), table, step=0.25)) == 0
+
+
+def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
+    dtm = terrain_model(cloud)
+    heights = height_above_ground(cloud, dtm)
+    truth = vineyard.rows.assign(row_id=vineyard.rows["row"], spacing_m=2.5)
+    sections = cut_sections(cloud, heights, truth, gaps_frame(), dtm)
+    canopy = separate_canopy(sections)
+    # Sections where vines are dead fall away, those of living vines stay.
+    dead = vineyard.dead_vines
+    dead = dead[dead.groupby("row")["vine"].transform("size") >= 3]
+    at = gpd.GeoSeries(gpd.points_from_xy(canopy.origin[:, 0], canopy.origin[:, 1]), crs=UTM)
+    assert at.distance(dead.union_all()).min() > 0.2
+    living = truth["n_vines"].sum() - truth["n_dead"].sum()
+    assert len(canopy.row_id) == pytest.approx(living * 0.9 / 0.25, rel=0.05)
+    assert canopy.height.min() >= 0.4
+    canopy, feet = find_feet(canopy)
+    assert np.median(feet[:, 0, 1]) == pytest.approx(0.6, abs=0.15)
+    assert (feet[:, 1, 0] >= feet[:, 2, 0]).all()
+    m = len(canopy.row_id)
+    table = measure_sections(canopy, np.tile(feet[:, [0, 1, 2]], (1, 1, 1)), np.full(m, 0.5), crs=UTM)
+    rows = summarise_rows(truth, table, step=0.25)
+    assert np.abs(rows["height_m"] - truth["mean_height"]).max() < 0.08
+    assert np.abs(rows["width_m"] - truth["mean_width"]).max() < 0.12
+    assert rows["volume_m3"].sum() == pytest.approx(0.5 * 0.25 * m)
+
+
+def one_section(points, heights=None):
+    points = np.asarray(points, dtype=float)
+    one = np.ones(1)
+    start = np.array([0, len(points)])
+    return Sections(
+        np.array([1]), one, np.zeros((1, 3)), np.array([[1.0, 0]]), 2.5 * one, start, points,
+        points[:, 1] if heights is None else heights,
+    )
+
+
+def test_soil_noise_on_flat_ground_is_no_canopy():
+    """Where h ≈ 0 the printed plane cuts through the soil, and half of its noise would be canopy."""
+    rng = np.random.default_rng(0)
+    soil = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.normal(0, 0.03, 200)])
+    leaves = np.column_stack([rng.normal(0, 0.2, 100), rng.uniform(0.6, 1.9, 100)])
+    canopy = separate_canopy(one_section(np.concatenate([soil, leaves])))
+    assert len(canopy.points) > 90
+    assert canopy.points[:, 1].min() > 0.5
+
+
+def test_flyers_are_no_canopy():
+    rng = np.random.default_rng(0)
+    leaves = np.column_stack([rng.normal(0, 0.15, 150), rng.uniform(0.6, 1.9, 150)])
+    flyers = np.array([[0.85, 1.5], [-0.8, 2.6], [0.7, 2.2]])
+    canopy = separate_canopy(one_section(np.concatenate([leaves, flyers])))
+    assert np.abs(canopy.points[:, 0]).max() < 0.6
+    assert canopy.points[:, 1].max() < 2.0
+
+
+def test_quantile_of_each_section():
+    rng = np.random.default_rng(0)
+    n = np.array([1, 0, 5, 100, 2])
+    values = rng.normal(size=n.sum())
+    start = np.concatenate([[0], np.cumsum(n)])
+    for q in (0.02, 0.5, 0.985):
+        expected = [np.quantile(values[a:b], q) if b > a else 0 for a, b in zip(start, start[1:], strict=False)]
+        assert np.allclose(quantile_of(values, start, q), expected)
