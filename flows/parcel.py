@@ -14,10 +14,10 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from vinemap import paths
-from vinemap.cli import fail, progress
+from vinemap.cli import plain_errors, progress
 from vinemap.config import SurveyConfig, choose_parcel, load_survey
 from vinemap.crs import parse_crs
-from vinemap.errors import InputError, VinemapError
+from vinemap.errors import ConfigError, InputError
 from vinemap.parcel import Summary, map_parcel
 from vinemap.synthetic import barolo, write_survey
 
@@ -73,15 +73,13 @@ def ensure_cloud(config: SurveyConfig) -> None:
 
 def main() -> None:
     """Map the parcel named on the command line."""
-    try:
+    with plain_errors():
         if len(sys.argv) != 3:
-            fail("give a survey's configuration and a parcel: python -m flows.parcel configs/barolo.yaml F")
+            raise ConfigError("give a survey's configuration and a parcel: python -m flows.parcel configs/barolo.yaml F")
         config = load_survey(Path(sys.argv[1]))
         parcel = choose_parcel(config, sys.argv[2])
         ensure_cloud(config)
         click.echo(parcel_flow(config.survey, parcel, config).line())
-    except VinemapError as error:
-        fail(error)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ import numpy as np
 import shapely
 from scipy.ndimage import correlate1d
 
-from vinemap.cloud import Sections
+from vinemap.mesh import Mesh, loft, merge
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
     from pyproj import CRS
+
+    from vinemap.cloud import Sections
 
     Values = NDArray[np.float64]
     Flags = NDArray[np.bool_]
@@ -75,7 +77,7 @@ def separate_canopy(
     n = np.bincount(section[canopy], minlength=len(sections.row_id))
     enough = n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)
     enough &= quantile_of(sections.height[canopy], np.concatenate([[0], np.cumsum(n)]), 0.9) >= min_height
-    return _subset(sections, canopy & enough[section], enough)
+    return sections.subset(canopy & enough[section], enough)
 
 
 def _plane_slope(sections: Sections, on: Flags, canopy: Flags) -> Values:
@@ -119,16 +121,6 @@ def _has_neighbours(points: Values, section: NDArray[np.int64], canopy: Flags, s
     return out
 
 
-def _subset(sections: Sections, points: Flags, kept: Flags) -> Sections:
-    n = np.bincount(sections.section[points], minlength=len(kept))[kept]
-    return Sections(
-        *(field[kept] for field in sections[:5]),
-        np.concatenate([[0], np.cumsum(n)]),
-        sections.points[points],
-        sections.height[points],
-    )
-
-
 def quantile_of(values: Values, start: NDArray[np.int64], q: float) -> Values:
     """Quantile (m,) of the values (n,) of each section; 0 where it has none."""
     n = np.diff(start)
@@ -158,7 +150,7 @@ def find_feet(canopy: Sections) -> tuple[Sections, Values]:
     """
     m = len(canopy.row_id)
     foot = quantile_of(canopy.points[:, 1], canopy.start, FOOT_QUANTILE)
-    canopy = _subset(canopy, canopy.points[:, 1] >= foot[canopy.section], np.ones(m, dtype=bool))
+    canopy = canopy.subset(canopy.points[:, 1] >= foot[canopy.section], np.ones(m, dtype=bool))
     y, z = canopy.points.T
     band = z <= foot[canopy.section] + FOOT_BAND
     n = np.bincount(canopy.section[band], minlength=m)
@@ -217,3 +209,32 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     return rows.assign(
         height_m=means["height_m"].to_numpy(), width_m=means["width_m"].to_numpy(), volume_m3=volume.to_numpy()
     )
+
+
+def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *, step: float) -> list[Mesh]:
+    """Closed meshes of the rows' canopies: polygons of consecutive sections, joined (Eq. 20–22).
+
+    A mesh closes and starts anew where sections are more than one and a half ``step`` apart.
+
+    Parameters
+    ----------
+    canopy : Sections
+        m sections in order of row and position.
+    polygons : (m, c, 2) array
+        Their c-gons.
+    rows : GeoDataFrame
+        Rows with ``row_id`` and ``label``; their numbers go with the meshes.
+    step : float
+        Metres between sections.
+    """
+    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
+    corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
+    breaks = (np.diff(canopy.row_id) != 0) | (np.diff(canopy.position) > 1.5 * step)
+    runs = np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1)
+    meshes = []
+    numbers = rows.drop(columns="geometry").set_index("row_id", drop=False)
+    for row_id, values in numbers.iterrows():
+        pieces = [loft(corners[run]) for run in runs if len(run) > 1 and canopy.row_id[run[0]] == row_id]
+        if pieces:
+            meshes.append(Mesh(*merge(pieces), row_id=int(values["row_id"]), label=str(values["label"]), extras=values.to_dict()))
+    return meshes

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -93,7 +94,8 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
 
     columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("Starting", total=None, parcel=parcel)
 
         def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
@@ -106,23 +108,36 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
 
 
 def main() -> None:
-    """Run a command; what is wrong with its input is said in one line, with exit code 2."""
-    try:
+    """Run a command of the command line."""
+    with plain_errors():
         commands.main(prog_name="vinemap", standalone_mode=False)
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Say errors in one line on stderr: exit code 2 for what the user can mend, 1 for a fault of vinemap's own.
+
+    ``VINEMAP_TRACEBACK=1`` lets a fault through with its traceback.
+    """
+    try:
+        yield
     except VinemapError as error:
-        fail(error)
-    except click.exceptions.Abort:
-        sys.exit(130)
+        _fail(error, 2)
     except click.ClickException as error:
-        fail(error.format_message())
-    except KeyboardInterrupt:
-        sys.exit(130)
+        _fail(error.format_message(), 2)
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        _fail("stopped", 130)
+    except MemoryError:
+        _fail("not enough memory: clip the cloud with --boundary", 2)
+    except Exception as error:
+        if os.environ.get("VINEMAP_TRACEBACK"):
+            raise
+        _fail(f"a fault of vinemap's own ({type(error).__name__}: {error}); VINEMAP_TRACEBACK=1 shows where", 1)
 
 
-def fail(reason: object) -> None:
-    """Say a reason in one line on stderr and exit with code 2."""
+def _fail(reason: object, code: int) -> NoReturn:
     click.echo(f"vinemap: {' '.join(str(reason).split())}", err=True)
-    sys.exit(2)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -69,6 +69,13 @@ class Sections(NamedTuple):
         """Section (n,) of each point."""
         return np.repeat(np.arange(len(self.row_id)), np.diff(self.start))
 
+    def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_]) -> Sections:
+        """The points (n,) and sections (m,) that are flagged; no point of a section that isn't may be."""
+        n = np.bincount(self.section[points], minlength=len(sections))[sections]
+        start = np.concatenate([[0], np.cumsum(n)])
+        fields = (field[sections] for field in self[:5])
+        return Sections(*fields, start, self.points[points], self.height[points])
+
 
 def read_cloud(
     path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None, tick: Callable[[float], None] | None = None

@@ -15,17 +15,16 @@ import numpy as np
 import shapely
 
 from vinemap import __version__, paths
-from vinemap.canopy import find_feet, measure_sections, separate_canopy, summarise_rows
+from vinemap.canopy import find_feet, measure_sections, section_meshes, separate_canopy, summarise_rows
 from vinemap.cgon import enclose
-from vinemap.cloud import PointCloud, read_cloud
+from vinemap.cloud import PointCloud, Sections, read_cloud
 from vinemap.clustering import cluster_rows
 from vinemap.config import Settings, check_name
 from vinemap.crs import Origin, horizontal, to_wgs84, transformer
 from vinemap.curves import trace_rows
-from vinemap.errors import InputError
 from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
 from vinemap.key_points import detect_key_points
-from vinemap.mesh import Mesh, loft_rows, write_glb
+from vinemap.mesh import Mesh, write_glb
 from vinemap.raster import Raster, RowField, write_cog
 from vinemap.row_field import canopy_cover, estimate_row_field
 from vinemap.row_table import describe_rows, number_rows
@@ -36,11 +35,26 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from numpy.typing import NDArray
     from pyproj import CRS
 
     Boundary = tuple[shapely.Geometry, CRS]
 
 T = TypeVar("T")
+
+STAGES = (
+    "Reading",
+    "DTM",
+    "Canopy cover",
+    "Row field",
+    "Key points",
+    "Clusters",
+    "Curves",
+    "Sections",
+    "Canopy",
+    "Mesh",
+    "Writing",
+)
 
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
 
@@ -53,6 +67,11 @@ class Summary(NamedTuple):
     rows: int
     length: float
     seconds: float
+
+    def line(self) -> str:
+        """The same as a sentence."""
+        found = f"{self.rows} rows, {self.length:,.0f} m" if self.rows else "no vine row found"
+        return f"{self.parcel}: {found}, in {self.seconds:.1f} s → {self.folder}"
 
 
 def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:  # noqa: ANN401
@@ -91,7 +110,7 @@ def map_parcel(
     origin : Origin, optional
         Origin of {Main}; by default the south-western corner of the parcel at its lowest terrain.
     step : callable
-        Runs a stage, as ``step(name, function, *args, **kwargs)``.
+        Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
     Raises
     ------
@@ -100,6 +119,7 @@ def map_parcel(
     """
     check_name(parcel)
     settings = settings or Settings()
+    began = time.perf_counter()
     seconds: dict[str, float] = {}
 
     def run(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:  # noqa: ANN401
@@ -108,52 +128,140 @@ def map_parcel(
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
+    def options(stage: str) -> dict[str, Any]:
+        values: dict[str, Any] = getattr(settings, stage).model_dump()
+        return values
+
     with paths.product(folder) as draft:
         polygon = read_boundary(boundary, parcel=parcel) if boundary else None
         points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon)
-        dtm, heights = run("Ground", _ground, points, settings)
-        field, cover = run("Row field", _row_field, points, heights, settings)
-        key_points = run("Key points", detect_key_points, cover, dtm, field, **settings.key_points.model_dump())
-        clusters = run("Clusters", cluster_rows, key_points, **settings.clustering.model_dump())
-        curves = run("Curves", trace_rows, clusters, cover, dtm, **settings.curves.model_dump())
-        rows, gaps = number_rows(*curves)
-        sections, polygons = run("Canopy", _canopy, points, heights, rows, gaps, dtm, settings)
-        rows = summarise_rows(rows, sections, step=settings.sections.step)
-        origin = origin or _default_origin(dtm)
+        dtm = run("DTM", terrain_model, points, **options("ground"))
+        heights = height_above_ground(points, dtm)
+        cover = run("Canopy cover", canopy_cover, points, heights, **options("cover"))
+        field = run("Row field", estimate_row_field, cover, **options("row_field"))
+        key_points = run("Key points", detect_key_points, cover, dtm, field, **options("key_points"))
+        clusters = run("Clusters", cluster_rows, key_points, **options("clustering"))
+        rows, gaps = number_rows(*run("Curves", trace_rows, clusters, cover, dtm, **options("curves")))
+        sections = run("Sections", cut_sections, points, heights, rows, gaps, dtm, **options("sections"))
+        canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
+        origin = origin or _corner(dtm)
         rows, ends, enhanced = describe_rows(
-            rows, parcel=parcel, origin=origin, threshold=settings.curves.threshold
+            summarise_rows(rows, table, step=settings.sections.step),
+            parcel=parcel,
+            origin=origin,
+            threshold=settings.curves.threshold,
         )
+        meshes = run("Mesh", section_meshes, canopy, outlines, rows, step=settings.sections.step)
         layers = {
             "rows": rows,
             "row_ends": ends,
             "key_points": enhanced,
-            "sections": _labelled(sections, rows),
+            "sections": _labelled(table, rows),
             "gaps": _labelled(gaps, rows),
-            "parcel": _parcel_layer(parcel, rows, dtm, polygon, points),
+            "parcel": _parcel_layer(parcel, rows, polygon, points),
         }
-        meshes = run("Meshes", loft_rows, polygons, rows)
-        rasters = {"dtm": dtm, "chm": canopy_height_model(points, heights)}
-        run("Writing", _write, draft, parcel, layers, rasters, field, meshes, points)
+        chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
+        run("Writing", _write, draft, parcel, layers, (dtm, chm), field, meshes, points)
+        counts = {"points": len(points.xyz), "key_points_found": len(key_points)}
+        counts |= {name: len(layer) for name, layer in layers.items()}
         record = {
+            "vinemap": __version__,
             "parcel": parcel,
+            "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
             "inputs": [_fingerprint(path) for path in (cloud, boundary) if path],
             "settings": settings.model_dump(mode="json"),
-            "crs": _crs_name(points.crs),
+            "crs": points.crs.to_string(),
             "vertical_datum": points.vertical,
             "origin": origin._asdict(),
-            "counts": {
-                "points": len(points.xyz),
-                "key_points_found": len(key_points),
-                "rows": len(rows),
-                "gaps": len(gaps),
-                "sections": len(sections),
-            },
-            "seconds": seconds,
+            "counts": counts,
+            "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
+            "versions": {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES},
+            "files": sorted(path.name for path in draft.iterdir()),
         }
-        _write_record(draft, record)
-    return Summary(parcel, folder, len(rows), float(rows["length_m"].sum()), sum(seconds.values()))
+        paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
+    return Summary(parcel, folder, len(rows), float(rows["length_m"].sum()), time.perf_counter() - began)
 
 
-def _ground(points: PointCloud, settings: Settings) -> tuple[Raster, np.ndarray[Any, np.dtype[np.float64]]]:
-    dtm = terrain_model(points, **settings.ground.model_dump())
-    return dtm, height_above_ground(points, dtm)
+def _model_canopy(
+    sections: Sections, settings: Settings, crs: CRS
+) -> tuple[Sections, NDArray[np.float64], gpd.GeoDataFrame]:
+    """Canopy points of every section, their c-gons (m, c, 2), and the table of sections."""
+    canopy, feet = find_feet(separate_canopy(sections, **settings.canopy.model_dump()))
+    enclosed = enclose(canopy.points, canopy.start, feet, **settings.polygon.model_dump())
+    canopy = canopy.subset(enclosed.kept, enclosed.valid)
+    polygons = enclosed.polygon[enclosed.valid]
+    return canopy, polygons, measure_sections(canopy, polygons, enclosed.area[enclosed.valid], crs=crs)
+
+
+def _corner(dtm: Raster) -> Origin:
+    """Origin of {Main} at the south-western corner of a raster, at its lowest elevation."""
+    grid = dtm.grid
+    south = grid.north - grid.ny * grid.resolution
+    lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
+    return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
+
+
+def _labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
+
+
+def _parcel_layer(
+    parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: PointCloud
+) -> gpd.GeoDataFrame:
+    """The parcel's polygon (the boundary, else the hull of its rows or of the cloud) and its totals."""
+    if boundary:
+        polygon, crs = boundary
+        convert = transformer(horizontal(crs), points.crs).transform
+        polygon = shapely.transform(polygon, lambda xy: np.column_stack(convert(*xy.T)))
+    elif len(rows):
+        polygon = shapely.buffer(shapely.force_2d(rows.union_all()).convex_hull, rows["spacing_m"].median() / 2)
+    else:
+        polygon = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
+    angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
+    totals = {
+        "parcel": parcel,
+        "n_rows": len(rows),
+        "rows_length_m": rows["length_m"].sum(),
+        "area_m2": polygon.area,
+        "spacing_m": rows["spacing_m"].median(),
+        "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
+        "gap_m": rows["gap_m"].sum(),
+        "vertical_datum": points.vertical or "",
+    }
+    parts = [part for part in shapely.get_parts(polygon) if part.geom_type == "Polygon"]
+    return gpd.GeoDataFrame([totals], geometry=[shapely.multipolygons(parts)], crs=points.crs)
+
+
+def _write(
+    folder: Path,
+    parcel: str,
+    layers: dict[str, gpd.GeoDataFrame],
+    surfaces: tuple[Raster, Raster],
+    field: RowField,
+    meshes: list[Mesh],
+    points: PointCloud,
+) -> None:
+    write_geopackage(layers, paths.geopackage(folder, parcel))
+    rasters = {
+        "dtm": (surfaces[0], "Terrain elevation", "m"),
+        "chm": (surfaces[1], "Height above terrain", "m"),
+        "row_direction": (field.direction, "Row direction, anticlockwise from east", "degree"),
+        "row_spacing": (field.spacing, "Inter-row spacing", "m"),
+        "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
+    }
+    for kind, (raster, description, unit) in rasters.items():
+        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit)
+    centre = points.xyz.mean(axis=0)
+    write_glb(
+        meshes,
+        paths.canopy_mesh(folder, parcel),
+        origin=tuple(np.round(centre).tolist()),
+        crs=points.crs.to_string(),
+        extras={"vertical": points.vertical},
+    )
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}

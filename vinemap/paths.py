@@ -20,6 +20,11 @@ RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 RUN = "run.json"
 
 
+def stem(cloud: Path) -> str:
+    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``)."""
+    return cloud.stem.removesuffix(".copc")
+
+
 def survey_cloud(survey: str) -> Path:
     """Cloud of a survey."""
     return DATA / "surveys" / survey / f"{survey}.laz"

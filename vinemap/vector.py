@@ -56,7 +56,7 @@ LAYERS: dict[str, Layer] = {
         "LineString Z", _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL), "Stretches of rows without canopy"
     ),
     "parcel": Layer(
-        "Polygon",
+        "MultiPolygon",
         {"parcel": TEXT, "n_rows": WHOLE}
         | dict.fromkeys(("rows_length_m", "area_m2", "spacing_m", "orientation_deg", "gap_m"), REAL)
         | {"vertical_datum": TEXT},

@@ -1,0 +1,135 @@
+"""The GeoPackage's contract, its styles, and boundaries."""
+
+import sqlite3
+import xml.etree.ElementTree as ET
+
+import geopandas as gpd
+import pandas as pd
+import pyogrio
+import pytest
+import shapely
+
+from vinemap.errors import InputError
+from vinemap.style import alias
+from vinemap.vector import LAYERS, conform, read_boundary, write_geopackage
+
+CONTRACT = {
+    "rows": (
+        "row_id label length_m orientation_deg elevation_m elevation_diff_m n_key_points e1_x e1_y e1_z en_x en_y en_z "
+        "e1_lat e1_lon e1_alt en_lat en_lon en_alt spacing_m height_m width_m volume_m3 gap_m"
+    ).split(),
+    "row_ends": "row_id label end".split(),
+    "key_points": "row_id label order position_m".split(),
+    "sections": "row_id label position_m height_m bottom_m width_m area_m2 n_points".split(),
+    "gaps": "row_id label start_m end_m length_m".split(),
+    "parcel": "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m vertical_datum".split(),
+}
+GEOMETRY = {
+    "rows": "LineString Z",
+    "row_ends": "Point Z",
+    "key_points": "Point Z",
+    "sections": "LineString Z",
+    "gaps": "LineString Z",
+    "parcel": "MultiPolygon",
+}
+
+
+def table(layer, n=2):
+    shapes = {
+        "LineString Z": shapely.LineString([[0, 0, 1], [3, 4, 2]]),
+        "Point Z": shapely.Point(1, 2, 3),
+        "MultiPolygon": shapely.MultiPolygon([shapely.box(0, 0, 5, 5)]),
+    }
+    sample = {"str": "a", "int64": 1, "float64": 0.5}
+    columns = {name: [sample[kind]] * n for name, kind in LAYERS[layer].columns.items()}
+    crs = 4326 if layer == "row_ends" else 32632
+    return gpd.GeoDataFrame(columns, geometry=[shapes[LAYERS[layer].geometry]] * n, crs=crs)
+
+
+def test_layers_and_columns_are_the_contracts():
+    assert {name: list(layer.columns) for name, layer in LAYERS.items()} == CONTRACT
+    assert {name: layer.geometry for name, layer in LAYERS.items()} == GEOMETRY
+
+
+@pytest.mark.parametrize("n", [0, 2])
+def test_geopackage_opens_with_all_layers(tmp_path, n):
+    path = tmp_path / "a.gpkg"
+    write_geopackage({name: table(name, n) for name in LAYERS}, path)
+    listed = {str(name): geometry for name, geometry in pyogrio.list_layers(path)}
+    assert {k: v for k, v in listed.items() if k != "layer_styles"} == GEOMETRY
+    for name, columns in CONTRACT.items():
+        frame = gpd.read_file(path, layer=name)
+        assert [c for c in frame.columns if c != "geometry"] == columns
+        assert len(frame) == n
+        assert frame.crs.to_epsg() == (4326 if name == "row_ends" else 32632)
+    assert pyogrio.read_info(path, layer="rows")["geometry_name"] == "geom"
+
+
+def test_styles_are_what_qgis_looks_for(tmp_path):
+    path = tmp_path / "a.gpkg"
+    write_geopackage({name: table(name) for name in LAYERS}, path)
+    with sqlite3.connect(path) as db:
+        styles = pd.read_sql("SELECT * FROM layer_styles", db)
+        contents = dict(db.execute("SELECT table_name, data_type FROM gpkg_contents").fetchall())
+        version = db.execute("PRAGMA user_version").fetchone()[0]
+    db.close()
+    assert version == 10200
+    assert contents["layer_styles"] == "attributes"
+    assert set(styles["f_table_name"]) == set(LAYERS)
+    assert (styles["f_geometry_column"] == "geom").all()
+    assert (styles["f_table_schema"] == "").all()
+    assert styles["useAsDefault"].astype(bool).all()
+    for name, text in zip(styles["f_table_name"], styles["styleQML"], strict=True):
+        style = ET.fromstring(text)
+        aliases = {a.get("field"): a.get("name") for a in style.iter("alias")}
+        assert list(aliases) == CONTRACT[name]
+        assert len(style.findall(".//symbol/layer")) == 1
+
+
+def test_aliases_read_well():
+    assert alias("length_m") == "Length (m)"
+    assert alias("orientation_deg") == "Orientation (°)"
+    assert alias("volume_m3") == "Volume (m³)"
+    assert alias("e1_lat") == "e1 lat"
+    assert alias("row_id") == "Row"
+
+
+def test_missing_column_is_named():
+    with pytest.raises(ValueError, match="rows lacks length_m"):
+        conform(table("rows").drop(columns="length_m"), "rows")
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson", "shp"])
+def test_boundaries_of_any_format(tmp_path, suffix):
+    polygon = shapely.box(7.9, 44.6, 7.91, 44.61)
+    path = tmp_path / f"b.{suffix}"
+    gpd.GeoDataFrame({"name": ["F"]}, geometry=[polygon], crs=4326).to_file(path)
+    found, crs = read_boundary(path)
+    assert found.equals(polygon)
+    assert crs.to_epsg() == 4326
+
+
+def test_boundary_of_the_named_parcel_or_of_all(tmp_path):
+    path = tmp_path / "b.gpkg"
+    squares = [shapely.box(k, 0, k + 0.9, 1) for k in range(3)]
+    gpd.GeoDataFrame({"no": [1, 2, 3], "Vigna": ["A", "B", "C"]}, geometry=squares, crs=32632).to_file(path)
+    assert read_boundary(path, parcel="B")[0].equals(squares[1])
+    assert read_boundary(path, parcel="other")[0].area == pytest.approx(2.7)
+
+
+def test_boundaries_that_are_none(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_boundary(tmp_path / "none.gpkg")
+    text = tmp_path / "b.gpkg"
+    text.write_text("no polygons")
+    with pytest.raises(InputError, match="can't be read"):
+        read_boundary(text)
+    lines = tmp_path / "lines.gpkg"
+    gpd.GeoDataFrame(geometry=[shapely.LineString([[0, 0], [1, 1]])], crs=32632).to_file(lines)
+    with pytest.raises(InputError, match="holds no polygon"):
+        read_boundary(lines)
+    bare = tmp_path / "bare.shp"
+    gpd.GeoDataFrame({"a": [1]}, geometry=[shapely.box(0, 0, 1, 1)], crs=32632).to_file(bare)
+    bare.with_suffix(".prj").unlink()
+    with pytest.raises(InputError, match="no CRS"):
+        read_boundary(bare)

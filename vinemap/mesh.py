@@ -1,0 +1,287 @@
+"""Canopy meshes: sections joined to closed pieces (Eq. 22), their volume, glTF, and Open3D's opinion of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+import vinemap
+from vinemap.errors import DependencyError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Vertices = NDArray[np.float64]
+    Faces = NDArray[np.int64]
+
+Z_UP_TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+"""Quaternion (x, y, z, w) that takes x east, y north, z up to glTF's x east, y up, z south."""
+GREEN = [0.13, 0.33, 0.07, 1.0]
+"""Linear RGBA of foliage."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """The canopy of one row: closed pieces, triangles counter-clockwise seen from outside."""
+
+    vertices: Vertices
+    """(n, 3) x east, y north, z up, m, in the parcel's metric CRS."""
+    faces: Faces
+    """(m, 3) indices of vertices."""
+    row_id: int = 0
+    label: str = ""
+    """Name of the row, "1 F"."""
+    extras: Mapping[str, Any] = field(default_factory=dict)
+    """The row's numbers, for the glTF node."""
+
+
+class Audit(NamedTuple):
+    """What Open3D says of a mesh."""
+
+    watertight: bool
+    edge_manifold: bool
+    self_intersecting: bool
+    volume: float
+    """m³; NaN where not watertight."""
+
+
+def loft(polygons: ArrayLike) -> tuple[Vertices, Faces]:
+    """Join consecutive sections' polygons to a closed piece.
+
+    Parameters
+    ----------
+    polygons : array_like of shape (k, c, 3)
+        Corresponding vertices of k sections, k >= 2, all turning the same way.
+
+    Returns
+    -------
+    vertices : ndarray of shape (k * c, 3)
+        The polygons' own.
+    faces : ndarray of shape (2 * c * k - 4, 3)
+        Eq. 22 with the index wrapped, section after section, then the caps; outward, whichever way the polygons turn.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 2 sections or 3 vertices.
+    """
+    sections = np.asarray(polygons, dtype=np.float64)
+    if sections.ndim != 3 or sections.shape[0] < 2 or sections.shape[1] < 3 or sections.shape[2] != 3:
+        raise ValueError(f"polygons have shape {sections.shape}: give (k, c, 3) with k >= 2 and c >= 3")
+    k, c = sections.shape[:2]
+    i = np.arange(c)
+    j = (i + 1) % c
+    ring = np.concatenate([np.column_stack([i, j, i + c]), np.column_stack([j, j + c, i + c])])
+    sides = (ring + c * np.arange(k - 1)[:, None, None]).reshape(-1, 3)
+    faces = np.concatenate([sides, _cap(sections[0])[:, ::-1], _cap(sections[-1]) + c * (k - 1)])
+    vertices = sections.reshape(-1, 3)
+    return vertices, faces if _volume(vertices, faces) >= 0 else faces[:, ::-1]
+
+
+def merge(pieces: Iterable[tuple[Vertices, Faces]]) -> tuple[Vertices, Faces]:
+    """The pieces of a row (it breaks at gaps) as one list of vertices (n, 3) and one of faces (m, 3)."""
+    vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
+    for points, triangles in pieces:
+        vertices.append(points)
+        faces.append(triangles + total)
+        total += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def volume(mesh: Mesh) -> float:
+    """Volume of a closed mesh, m³ (divergence theorem)."""
+    return _volume(mesh.vertices, mesh.faces)
+
+
+def _volume(vertices: Vertices, faces: Faces) -> float:
+    if len(faces) == 0:
+        return 0.0
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def _cap(polygon: Vertices) -> Faces:
+    """Triangles (c - 2, 3) of a polygon (c, 3), convex or not, turning as it does (ear clipping in its own plane)."""
+    spread = polygon - polygon.mean(axis=0)
+    normal = np.cross(spread, np.roll(spread, -1, axis=0)).sum(axis=0)
+    u, v = _axes(normal)
+    flat = np.column_stack([spread @ u, spread @ v])
+    left = list(range(len(polygon)))
+    triangles = []
+    while len(left) > 3:
+        corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
+        # Of the ears the fattest, and where rounding or a crossing leaves none, the corner nearest to being one.
+        ear = max(corners, key=lambda t: (not _holds(flat, t, left), _fatness(*flat[list(t)])))
+        triangles.append(ear)
+        left.remove(ear[1])
+    return np.array([*triangles, left], dtype=np.int64)
+
+
+def _axes(normal: Vertices) -> tuple[Vertices, Vertices]:
+    """Two unit vectors across a normal, right-handed with it."""
+    n = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    u = np.cross(np.eye(3)[int(np.argmin(np.abs(n)))], n)
+    u /= np.linalg.norm(u)
+    return u, np.cross(n, u)
+
+
+def _cross(a: Vertices, b: Vertices, p: Vertices) -> float:
+    return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
+
+
+def _fatness(a: Vertices, b: Vertices, c: Vertices) -> float:
+    """Twice the area over the longest side squared: negative for a reflex corner."""
+    longest = max(float(((p - q) ** 2).sum()) for p, q in ((a, b), (b, c), (c, a)))
+    return _cross(a, b, c) / longest if longest > 0 else 0.0
+
+
+def _holds(flat: Vertices, corner: tuple[int, int, int], others: Sequence[int]) -> bool:
+    """Whether a corner is reflex, or its triangle holds another vertex."""
+    a, b, c = flat[list(corner)]
+    if _cross(a, b, c) <= 0:
+        return True
+    return any(
+        min(_cross(a, b, flat[i]), _cross(b, c, flat[i]), _cross(c, a, flat[i])) >= 0
+        for i in others
+        if not any(np.array_equal(flat[i], p) for p in (a, b, c))
+    )
+
+
+def write_glb(
+    meshes: Sequence[Mesh], path: Path, *, origin: ArrayLike, crs: str, extras: Mapping[str, Any] | None = None
+) -> None:
+    """Write rows as binary glTF: metres, Y up, float32 about a local origin, one node a row.
+
+    The root node turns Z up to Y up and holds ``crs`` and ``origin`` in its extras; each row's node, named by its
+    label, is moved to the row's middle, so that float32 keeps micrometres. Faces are shaded flat (no normals).
+
+    Parameters
+    ----------
+    meshes : sequence of Mesh
+        Rows; those without faces get a node without a mesh.
+    path : Path
+        File to write.
+    origin : array_like of shape (3,)
+        Point of the CRS (x, y, z) that becomes (0, 0, 0), m.
+    crs : str
+        The horizontal CRS, "EPSG:32632".
+    extras : mapping, optional
+        More for the root node: vertical datum ("vertical"), parcel, survey.
+    """
+    import pygltflib as gltf  # noqa: PLC0415  (100 ms, for one function)
+
+    zero = np.asarray(origin, dtype=np.float64)
+    root_extras = {"crs": crs, "vertical": None, **(extras or {}), "origin": zero}
+    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=_plain(root_extras))
+    out = gltf.GLTF2(
+        asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
+        scene=0,
+        scenes=[gltf.Scene(nodes=[0])],
+        nodes=[root],
+    )
+    positions, indices = bytearray(), bytearray()
+    stored: dict[bytes, int] = {}
+    for mesh in meshes:
+        node = gltf.Node(name=mesh.label, extras=_plain({"row_id": mesh.row_id, **mesh.extras}))
+        out.nodes.append(node)
+        if len(mesh.faces) == 0:
+            continue
+        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+        local = (mesh.vertices - middle).astype("<f4")
+        # 65535 is the primitive restart value.
+        kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(local) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
+        triangles = mesh.faces.astype(kind).tobytes()
+        node.translation = (middle - zero).tolist()
+        node.mesh = len(out.meshes)
+        if triangles not in stored:
+            stored[triangles] = len(out.accessors)
+            indices += b"\0" * (-len(indices) % 4)
+            out.accessors.append(
+                gltf.Accessor(
+                    bufferView=1, byteOffset=len(indices), componentType=code, count=mesh.faces.size, type=gltf.SCALAR
+                )
+            )
+            indices += triangles
+        out.accessors.append(
+            gltf.Accessor(
+                bufferView=0,
+                byteOffset=len(positions),
+                componentType=gltf.FLOAT,
+                count=len(local),
+                type=gltf.VEC3,
+                min=local.min(axis=0).tolist(),
+                max=local.max(axis=0).tolist(),
+            )
+        )
+        positions += local.tobytes()
+        primitive = gltf.Primitive(
+            attributes=gltf.Attributes(POSITION=len(out.accessors) - 1), indices=stored[triangles], material=0
+        )
+        out.meshes.append(gltf.Mesh(name=mesh.label, primitives=[primitive]))
+    root.children = list(range(1, len(out.nodes)))
+    if out.meshes:
+        out.materials = [
+            gltf.Material(
+                name="foliage",
+                pbrMetallicRoughness=gltf.PbrMetallicRoughness(
+                    baseColorFactor=GREEN, metallicFactor=0.0, roughnessFactor=0.9
+                ),
+            )
+        ]
+        out.bufferViews = [
+            gltf.BufferView(
+                buffer=0, byteOffset=0, byteLength=len(positions), byteStride=12, target=gltf.ARRAY_BUFFER
+            ),
+            gltf.BufferView(
+                buffer=0, byteOffset=len(positions), byteLength=len(indices), target=gltf.ELEMENT_ARRAY_BUFFER
+            ),
+        ]
+        out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
+        out.set_binary_blob(bytes(positions + indices))
+    out.save_binary(str(path))
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401  (any JSON)
+    """A value as JSON has it: numpy's numbers as Python's, what isn't finite as null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def audit(mesh: Mesh) -> Audit:
+    """Check a mesh with Open3D.
+
+    Raises
+    ------
+    DependencyError
+        If Open3D can't be loaded.
+    """
+    try:
+        import open3d  # noqa: PLC0415  (1 s, 400 MB, and needs system libraries)
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"Open3D can't be loaded ({error}): apt-get install libegl1 libgl1 libusb-1.0-0, or pip install open3d-cpu"
+        ) from error
+    middle = mesh.vertices.mean(axis=0) if len(mesh.vertices) else 0.0
+    shape = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(mesh.vertices - middle), open3d.utility.Vector3iVector(mesh.faces)
+    )
+    watertight = bool(shape.is_watertight())
+    return Audit(
+        watertight,
+        bool(shape.is_edge_manifold(allow_boundary_edges=False)),
+        bool(shape.is_self_intersecting()),
+        volume(mesh) if watertight else math.nan,
+    )
