@@ -30,7 +30,7 @@ def as_tasks(show: Callable[..., Any]) -> Callable[..., Any]:
 
     def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
         # Without parameters, as Prefect would walk through every array that it is given.
-        stage = task(lambda: function(*args, **kwargs), name=name, cache_policy=NO_CACHE, persist_result=False)
+        stage = task(name=name, cache_policy=NO_CACHE, persist_result=False)(lambda: function(*args, **kwargs))
         return show(name, stage)
 
     return step
@@ -75,7 +75,9 @@ def main() -> None:
     """Map the parcel named on the command line."""
     with plain_errors():
         if len(sys.argv) != 3:
-            raise ConfigError("give a survey's configuration and a parcel: python -m flows.parcel configs/barolo.yaml F")
+            raise ConfigError(
+                "give a survey's configuration and a parcel: python -m flows.parcel configs/barolo.yaml F"
+            )
         config = load_survey(Path(sys.argv[1]))
         parcel = choose_parcel(config, sys.argv[2])
         ensure_cloud(config)

@@ -49,8 +49,9 @@ def test_clips_to_a_polygon_in_another_crs(tmp_path, points):
 
 def test_degrees_become_utm(tmp_path, points):
     lon, lat = Transformer.from_crs(32632, 4326, always_xy=True).transform(points[:, 0], points[:, 1])
-    path = write_las(tmp_path / "a.las", np.column_stack([lon, lat, points[:, 2]]), CRS.from_epsg(4979),
-                     scales=(1e-9, 1e-9, 0.001))
+    path = write_las(
+        tmp_path / "a.las", np.column_stack([lon, lat, points[:, 2]]), CRS.from_epsg(4979), scales=(1e-9, 1e-9, 0.001)
+    )
     cloud = read_cloud(path)
     assert cloud.crs.to_epsg() == 32632
     assert np.allclose(cloud.xyz, points, atol=0.002)

@@ -30,8 +30,14 @@ def test_survey_with_settings(write):
     ("text", "said"),
     [
         (SURVEY + "setings: {}\n", "unknown key setings: did you mean 'settings'?"),
-        (SURVEY + "settings: {ground: {resolutoin: 1}}\n", "unknown key settings.ground.resolutoin: did you mean 'resolution'?"),
-        (SURVEY + "settings: {ground: {resolution: 0}}\n", "settings.ground.resolution = 0: input should be greater than or equal to 0.05"),
+        (
+            SURVEY + "settings: {ground: {resolutoin: 1}}\n",
+            "unknown key settings.ground.resolutoin: did you mean 'resolution'?",
+        ),
+        (
+            SURVEY + "settings: {ground: {resolution: 0}}\n",
+            "settings.ground.resolution = 0: input should be greater than or equal to 0.05",
+        ),
         (SURVEY + "settings: {cover: {low: 3}}\n", r"low (3.0) must be below high (2.9)"),
         (SURVEY + "settings: {polygon: {c: 4}}\n", "settings.polygon.c = 4"),
         ("survey: barolo\n", "parcels is missing"),

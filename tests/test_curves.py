@@ -36,7 +36,8 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
     data = data[np.random.default_rng(0).permutation(len(data))]
     points = gpd.GeoDataFrame(
         {"direction_deg": data[:, 2], "cluster": data[:, 3].astype(int), "spacing_m": 2.5},
-        geometry=gpd.points_from_xy(data[:, 0], data[:, 1]), crs=UTM,
+        geometry=gpd.points_from_xy(data[:, 0], data[:, 1]),
+        crs=UTM,
     )
     return points, Raster(cover, grid, UTM), dtm
 

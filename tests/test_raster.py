@@ -49,8 +49,12 @@ def test_bilinear_sampling_is_exact_on_a_plane():
 def test_cog_keeps_values_nodata_units_and_place(tmp_path):
     values = np.arange(300 * 700, dtype=float).reshape(300, 700)
     values[5, 7] = np.nan
-    write_cog(Raster(values, Grid(414000.0, 4940000.0, 0.25, 300, 700), UTM), tmp_path / "x.tif",
-              description="terrain", unit="m")
+    write_cog(
+        Raster(values, Grid(414000.0, 4940000.0, 0.25, 300, 700), UTM),
+        tmp_path / "x.tif",
+        description="terrain",
+        unit="m",
+    )
     with rasterio.open(tmp_path / "x.tif") as src:
         assert src.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert src.crs.to_epsg() == 32632

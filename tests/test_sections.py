@@ -1,5 +1,7 @@
 """Sections along rows, and canopy told from terrain in them."""
 
+from itertools import pairwise
+
 import geopandas as gpd
 import numpy as np
 import pytest
@@ -54,7 +56,9 @@ def test_every_section_holds_the_points_around_its_station():
 def test_sections_leave_gaps_out():
     line = np.array([[0, 0], [20.0, 0]])
     xyz = np.random.default_rng(0).uniform([-1, -1, 0], [21, 1, 2], (5000, 3))
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame([line]), gaps_frame((1, 5.0, 9.0)), flat(-5, -5))
+    sections = cut_sections(
+        PointCloud(xyz, UTM), xyz[:, 2], rows_frame([line]), gaps_frame((1, 5.0, 9.0)), flat(-5, -5)
+    )
     assert not ((sections.position > 5) & (sections.position < 9)).any()
     assert sections.position.max() == 20
 
@@ -107,7 +111,13 @@ def one_section(points, heights=None):
     one = np.ones(1)
     start = np.array([0, len(points)])
     return Sections(
-        np.array([1]), one, np.zeros((1, 3)), np.array([[1.0, 0]]), 2.5 * one, start, points,
+        np.array([1]),
+        one,
+        np.zeros((1, 3)),
+        np.array([[1.0, 0]]),
+        2.5 * one,
+        start,
+        points,
         points[:, 1] if heights is None else heights,
     )
 
@@ -137,5 +147,5 @@ def test_quantile_of_each_section():
     values = rng.normal(size=n.sum())
     start = np.concatenate([[0], np.cumsum(n)])
     for q in (0.02, 0.5, 0.985):
-        expected = [np.quantile(values[a:b], q) if b > a else 0 for a, b in zip(start, start[1:], strict=False)]
+        expected = [np.quantile(values[a:b], q) if b > a else 0 for a, b in pairwise(start)]
         assert np.allclose(quantile_of(values, start, q), expected)

@@ -236,5 +236,7 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     for row_id, values in numbers.iterrows():
         pieces = [loft(corners[run]) for run in runs if len(run) > 1 and canopy.row_id[run[0]] == row_id]
         if pieces:
-            meshes.append(Mesh(*merge(pieces), row_id=int(values["row_id"]), label=str(values["label"]), extras=values.to_dict()))
+            meshes.append(
+                Mesh(*merge(pieces), row_id=int(values["row_id"]), label=str(values["label"]), extras=values.to_dict())
+            )
     return meshes

@@ -1,7 +1,8 @@
 """Sections of canopy: convex hull, outlier peeling (Algorithm 1) and the minimum-area c-gon (Problem 1).
 
-A section's points are (y, z): y lateral, positive to the right, and z height, in metres; polygons run counter-clockwise.
-Compiled code (cached on disk, without the GIL) takes them as complex numbers y + iz.
+A section's points are (y, z), y lateral, positive to the right, z height, in metres; polygons run counter-clockwise.
+Compiled code (cached on disk, without the GIL) takes them as complex numbers y + iz. It stays in one file, because
+numba's cache doesn't notice changes in others.
 """
 
 from __future__ import annotations
@@ -208,8 +209,9 @@ def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
 
 
 @_compiled
-def _expose(p: Points, inner: Flags, a: int, u: int, b: int, chain: Ints) -> tuple[int, float]:
-    """Hull from a to b once u, the vertex between them, is gone: size of ``chain``, and twice the area lost."""
+def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[int, float]:
+    """Hull from one neighbour of u to the other once u is gone: size of ``chain``, and twice the area lost."""
+    a, b = ring[0, u], ring[1, u]
     chain[0] = a
     if u + 1 < len(p) and inner[u + 1] and p[u + 1] == p[u]:
         chain[1], chain[2] = u + 1, b
@@ -239,39 +241,39 @@ def _expose(p: Points, inner: Flags, a: int, u: int, b: int, chain: Ints) -> tup
 def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
     """Positions removed from sorted points, in order, and those on the hull that is left; ``index`` breaks ties."""
     n = len(p)
-    count = max(min(count, n - 3), 0)
-    ring = _hull(p)
-    size = len(ring)
-    removed = np.empty(count, dtype=np.int64)
-    if count == 0 or size < 3:
-        return removed[:0], ring
-    before, after, chain = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64), np.empty(n + 1, dtype=np.int64)
+    vertices = _hull(p)
+    size = len(vertices)
+    removed = np.empty(max(min(count, n - 3), 0), dtype=np.int64)
+    if len(removed) == 0 or size < 3:
+        return removed[:0], vertices
+    ring, chain = np.empty((2, n), dtype=np.int64), np.empty(n + 1, dtype=np.int64)
     loss, inner = np.empty(n), np.ones(n, dtype=np.bool_)
     for k in range(size):
-        after[ring[k - 1]], before[ring[k]], inner[ring[k]] = ring[k], ring[k - 1], False
-    for k in range(size):
-        loss[ring[k]] = _expose(p, inner, before[ring[k]], ring[k], after[ring[k]], chain)[1]
-    head, done = ring[0], 0
-    while done < count and size >= 3:
-        best, u = head, after[head]
+        u, v = vertices[k - 1], vertices[k]
+        ring[1, u], ring[0, v], inner[v] = v, u, False
+    for u in vertices:
+        loss[u] = _expose(p, inner, ring, u, chain)[1]
+    head, done = vertices[0], 0
+    while done < len(removed) and size >= 3:
+        best, u = head, ring[1, head]
         while u != head:
             if loss[u] > loss[best] or (loss[u] == loss[best] and index[u] < index[best]):
                 best = u
-            u = after[u]
+            u = ring[1, u]
         removed[done] = best
         done += 1
-        head, u = before[best], after[best]
-        length = _expose(p, inner, head, best, u, chain)[0]
+        head, u = ring[0, best], ring[1, best]
+        length = _expose(p, inner, ring, best, chain)[0]
         size += length - 3
         for k in range(1, length):
-            after[chain[k - 1]], before[chain[k]], inner[chain[k]] = chain[k], chain[k - 1], False
+            ring[1, chain[k - 1]], ring[0, chain[k]], inner[chain[k]] = chain[k], chain[k - 1], False
         for _ in range(length if size >= 3 else 0):
-            loss[u] = _expose(p, inner, before[u], u, after[u], chain)[1]
-            u = before[u]
+            loss[u] = _expose(p, inner, ring, u, chain)[1]
+            u = ring[0, u]
     left = np.empty(size, dtype=np.int64)
     for k in range(size):
         left[k] = head
-        head = after[head]
+        head = ring[1, head]
     return removed[:done], left
 
 
@@ -374,7 +376,8 @@ def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
 def _choose(q: Points, c: int) -> Points:
     """The c - 3 free vertices: c - 2 of the outline's edges, first and last included, that add the least area to it.
 
-    All are flush but at most one. State: whether the one not flush is spent, edges used so far, the last of them.
+    All are flush but at most one; no vertices where no choice closes the polygon. State of the dynamic programme:
+    whether the one not flush is spent, edges used so far, the last of them.
     """
     n, edges = len(q) - 1, c - 2
     swept = np.zeros(n + 1)
@@ -392,9 +395,16 @@ def _choose(q: Points, c: int) -> Points:
                         cost[spent, used, j], origin[spent, used, j] = cost[spent, used - 1, i] + flush, i
                 if used > 1 and cost[0, used - 2, i] + skip < cost[1, used, j]:
                     cost[1, used, j], origin[1, used, j] = cost[0, used - 2, i] + skip, -1 - i
-    spent = 1 if cost[1, edges - 1, n - 1] < cost[0, edges - 1, n - 1] else 0
-    free = np.empty(c - 3, dtype=np.complex128)
-    used, j = edges - 1, n - 1
+    if min(cost[0, edges - 1, n - 1], cost[1, edges - 1, n - 1]) == math.inf:
+        return q[:0]
+    return _trace(q, origin, 1 if cost[1, edges - 1, n - 1] < cost[0, edges - 1, n - 1] else 0)
+
+
+@_compiled
+def _trace(q: Points, origin: Ints, spent: int) -> Points:
+    """The vertices of a choice, from its last edge back."""
+    used, j = origin.shape[1] - 1, origin.shape[2] - 1
+    free = np.empty(used, dtype=np.complex128)
     while used > 0:
         i = origin[spent, used, j]
         if i >= 0:
@@ -450,8 +460,11 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
     if len(q) > LONGEST:
         q = _simplify(q)
     c = len(out)
-    out[0], out[1], out[c - 1] = bottom, q[0], q[-1]
     free = _split(q, c) if len(q) < c else _choose(q, c)
+    while len(free) == 0:  # it turns too far for so few edges: the feet stand on the underside, and move to its ends
+        q = q[1:-1]
+        free = _split(q, c) if len(q) < c else _choose(q, c)
+    out[0], out[1], out[c - 1] = bottom, q[0], q[-1]
     for k in range(c - 3):
         out[k + 2] = free[k]
     if _cross(q[-1], q[0], bottom) > 0:
@@ -461,7 +474,9 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
 
 
 @_compiled
-def _enclose_all(points: Points, start: Ints, feet: Points, c: int, share: float) -> tuple[Points, Flags, Floats, Floats]:
+def _enclose_all(
+    points: Points, start: Ints, feet: Points, c: int, share: float
+) -> tuple[Points, Flags, Floats, Floats]:
     m = len(feet)
     polygon = np.full((m, c), complex(math.nan, math.nan))
     hull_area, area = np.full(m, math.nan), np.full(m, math.nan)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 FILE = click.Path(path_type=Path)
 
 
-class _Origin(click.ParamType):
+class _Origin(click.ParamType):  # type: ignore[type-arg]
     name = "LAT,LON,ALT"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
@@ -28,7 +28,9 @@ class _Origin(click.ParamType):
         try:
             lat, lon, alt = (float(part) for part in str(value).split(","))
         except ValueError:
-            self.fail(f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx)
+            self.fail(
+                f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx
+            )
         if not (-90 <= lat <= 90 and -180 <= lon <= 180):
             self.fail(f"{value!r} lies on no globe: latitude comes first, in degrees", param, ctx)
         return Origin(lat, lon, alt)

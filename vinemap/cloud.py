@@ -73,8 +73,16 @@ class Sections(NamedTuple):
         """The points (n,) and sections (m,) that are flagged; no point of a section that isn't may be."""
         n = np.bincount(self.section[points], minlength=len(sections))[sections]
         start = np.concatenate([[0], np.cumsum(n)])
-        fields = (field[sections] for field in self[:5])
-        return Sections(*fields, start, self.points[points], self.height[points])
+        return Sections(
+            self.row_id[sections],
+            self.position[sections],
+            self.origin[sections],
+            self.tangent[sections],
+            self.spacing[sections],
+            start,
+            self.points[points],
+            self.height[points],
+        )
 
 
 def read_cloud(
@@ -204,10 +212,11 @@ def _clipper(boundary: Boundary, target: CRS, path: Path) -> Callable[[NDArray[n
     polygon, crs = boundary
     convert = transformer(horizontal(crs), target).transform
     polygon = shapely.force_2d(shapely.transform(polygon, lambda xy: np.column_stack(convert(*xy.T))))
-    if not np.isfinite(polygon.bounds).all():
+    bounds = shapely.bounds(polygon)
+    if not np.isfinite(bounds).all():
         raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
     shapely.prepare(polygon)
-    west, south, east, north = polygon.bounds
+    west, south, east, north = bounds
 
     def inside(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
         x, y = xyz[:, 0], xyz[:, 1]
@@ -224,7 +233,7 @@ def _without_strays(xyz: NDArray[np.float64], path: Path) -> NDArray[np.float64]
     span = high - low
     if span[:2].max() > LARGEST_SPAN:
         raise InputError(
-            f"{path}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check its scale, offset and CRS"
+            f"{path}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check scale, offset and CRS"
         )
     reach = 0.5 * span + [50.0, 50.0, 100.0]
     inside = ((xyz >= low - reach) & (xyz <= high + reach)).all(axis=1)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
     Labels = NDArray[np.int64]
 
 TANGENT_LENGTH = 5.0
@@ -119,7 +119,8 @@ def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, graph:
     position = _position_along(pieces, graph)
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
-    out = _Ends(*(np.zeros((2 * len(first) - 2, 2)) for _ in range(3)), np.zeros(2 * len(first) - 2))
+    n = 2 * (len(first) - 1)
+    out = _Ends(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n))
     for p in range(len(first) - 1):
         members = order[first[p] : first[p + 1]]
         s = position[members]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vinemap.crs import Origin
+from vinemap.crs import Origin  # noqa: TC001  (pydantic reads the annotation)
 from vinemap.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -18,9 +18,11 @@ from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from vinemap.raster import Raster, sample
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
 
 STATION = 0.1
 """Metres between the stations of a straightened row."""
@@ -319,6 +321,6 @@ def _line(curve: Values, dtm: Raster) -> shapely.LineString:
     return shapely.LineString(np.column_stack([curve, sample(dtm, curve)]))
 
 
-def _frame(records: list[tuple[object, ...]], columns: list[str], cover: Raster) -> gpd.GeoDataFrame:
+def _frame(records: Sequence[tuple[object, ...]], columns: list[str], cover: Raster) -> gpd.GeoDataFrame:
     data = {name: [r[k] for r in records] for k, name in enumerate(columns)}
     return gpd.GeoDataFrame(data, geometry=[r[-1] for r in records], crs=cover.crs)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_opening, correlate1d
+from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtri
 
 from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample
@@ -27,6 +27,8 @@ COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
 STEP = 0.001
 """Heights are sorted in steps of a millimetre."""
+SPIKE = 0.3
+"""Metres by which a cell of the canopy height model may stand out."""
 NARROWEST = 3.0
 """Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
 RIDGE = 0.02
@@ -103,11 +105,15 @@ def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
 def canopy_height_model(cloud: PointCloud, heights: Values, *, resolution: float = 0.25) -> Raster:
     """Canopy height model: the 98% height in metres of each cell's points, NaN where there is none.
 
-    A quantile instead of the maximum, so that a single point in the air doesn't make a tower.
+    A cell stands no higher than the highest of its eight neighbours by more than ``SPIKE``, so that a point in the
+    air doesn't make a tower.
     """
     grid = grid_over(cloud.xyz, resolution=resolution)
     cells = _order_statistics(heights, cell_of(cloud.xyz, grid), grid, 0.98)
-    return Raster(np.where(cells.n > 0, np.maximum(cells.low, 0), np.nan), grid, cloud.crs)
+    height = np.maximum(cells.low, 0)
+    around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+    height = np.minimum(height, maximum_filter(height, footprint=around) + SPIKE)
+    return Raster(np.where(cells.n > 0, height, np.nan), grid, cloud.crs)
 
 
 def _coarse_surface(xyz: Values, grid: Grid) -> Values:

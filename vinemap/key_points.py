@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from vinemap.raster import Grid, Raster, RowField
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
 
 BATCH = 20_000
 SLICES = 5
@@ -86,7 +86,9 @@ def central_points(origin: Values, offsets: Values, direction: Values) -> Values
 
     Eq. 2–3, with ϑ the direction of the row.
     """
-    return origin + offsets[:, None] * np.column_stack([-np.sin(direction), np.cos(direction)])
+    normal = np.column_stack([-np.sin(direction), np.cos(direction)])
+    out: Values = origin + offsets[:, None] * normal
+    return out
 
 
 def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> Values:
@@ -99,7 +101,8 @@ def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> V
     j = np.clip(((xy[:, 0] - cells.west) / cells.resolution).astype(int), 0, cells.nx - 1)
     direction, spacing = field.direction.values[i, j], field.spacing.values[i, j]
     likely = (field.likelihood.values[i, j] >= min_likelihood) & np.isfinite(direction) & np.isfinite(spacing)
-    return np.column_stack([xy, np.radians(direction), spacing])[likely]
+    nodes: Values = np.column_stack([xy, np.radians(direction), spacing])[likely]
+    return nodes
 
 
 def _profiles(

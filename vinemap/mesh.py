@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -107,50 +108,40 @@ def _volume(vertices: Vertices, faces: Faces) -> float:
 
 
 def _cap(polygon: Vertices) -> Faces:
-    """Triangles (c - 2, 3) of a polygon (c, 3), convex or not, turning as it does (ear clipping in its own plane)."""
+    """Triangles (c - 2, 3) of a polygon (c, 3), convex or not, turning as it does (ear clipping)."""
     spread = polygon - polygon.mean(axis=0)
     normal = np.cross(spread, np.roll(spread, -1, axis=0)).sum(axis=0)
-    u, v = _axes(normal)
-    flat = np.column_stack([spread @ u, spread @ v])
-    left = list(range(len(polygon)))
+    axis = int(np.argmax(np.abs(normal)))
+    u, v = ((axis + 1) % 3, (axis + 2) % 3) if normal[axis] >= 0 else ((axis + 2) % 3, (axis + 1) % 3)
+    flat = [complex(*point) for point in spread[:, [u, v]]]
+    left = list(range(len(flat)))
     triangles = []
     while len(left) > 3:
         corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
-        # Of the ears the fattest, and where rounding or a crossing leaves none, the corner nearest to being one.
-        ear = max(corners, key=lambda t: (not _holds(flat, t, left), _fatness(*flat[list(t)])))
+        # Of the ears the fattest; where a crossing or rounding leaves none, the corner nearest to being one.
+        ear = max(corners, key=lambda t: (_is_ear(flat, t, left), _fatness(*(flat[i] for i in t))))
         triangles.append(ear)
         left.remove(ear[1])
     return np.array([*triangles, left], dtype=np.int64)
 
 
-def _axes(normal: Vertices) -> tuple[Vertices, Vertices]:
-    """Two unit vectors across a normal, right-handed with it."""
-    n = normal / max(float(np.linalg.norm(normal)), 1e-300)
-    u = np.cross(np.eye(3)[int(np.argmin(np.abs(n)))], n)
-    u /= np.linalg.norm(u)
-    return u, np.cross(n, u)
+def _cross(a: complex, b: complex, p: complex) -> float:
+    return ((b - a).conjugate() * (p - a)).imag
 
 
-def _cross(a: Vertices, b: Vertices, p: Vertices) -> float:
-    return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
-
-
-def _fatness(a: Vertices, b: Vertices, c: Vertices) -> float:
+def _fatness(a: complex, b: complex, c: complex) -> float:
     """Twice the area over the longest side squared: negative for a reflex corner."""
-    longest = max(float(((p - q) ** 2).sum()) for p, q in ((a, b), (b, c), (c, a)))
-    return _cross(a, b, c) / longest if longest > 0 else 0.0
+    longest = max(abs(a - b), abs(b - c), abs(c - a))
+    return _cross(a, b, c) / longest**2 if longest > 0 else 0.0
 
 
-def _holds(flat: Vertices, corner: tuple[int, int, int], others: Sequence[int]) -> bool:
-    """Whether a corner is reflex, or its triangle holds another vertex."""
-    a, b, c = flat[list(corner)]
+def _is_ear(flat: Sequence[complex], corner: tuple[int, int, int], others: Sequence[int]) -> bool:
+    """Whether a corner is convex, and its triangle holds no other vertex."""
+    a, b, c = (flat[i] for i in corner)
     if _cross(a, b, c) <= 0:
-        return True
-    return any(
-        min(_cross(a, b, flat[i]), _cross(b, c, flat[i]), _cross(c, a, flat[i])) >= 0
-        for i in others
-        if not any(np.array_equal(flat[i], p) for p in (a, b, c))
-    )
+        return False
+    rest = {flat[i] for i in others} - {a, b, c}
+    return not any(min(_cross(a, b, p), _cross(b, c, p), _cross(c, a, p)) >= 0 for p in rest)
 
 
 def write_glb(
@@ -177,8 +168,8 @@ def write_glb(
     import pygltflib as gltf  # noqa: PLC0415  (100 ms, for one function)
 
     zero = np.asarray(origin, dtype=np.float64)
-    root_extras = {"crs": crs, "vertical": None, **(extras or {}), "origin": zero}
-    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=_plain(root_extras))
+    placed = {"crs": crs, **(extras or {}), "origin": zero}
+    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=_plain(placed))
     out = gltf.GLTF2(
         asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
         scene=0,
@@ -235,20 +226,27 @@ def write_glb(
             )
         ]
         out.bufferViews = [
-            gltf.BufferView(
-                buffer=0, byteOffset=0, byteLength=len(positions), byteStride=12, target=gltf.ARRAY_BUFFER
-            ),
+            gltf.BufferView(buffer=0, byteOffset=0, byteLength=len(positions), byteStride=12, target=gltf.ARRAY_BUFFER),
             gltf.BufferView(
                 buffer=0, byteOffset=len(positions), byteLength=len(indices), target=gltf.ELEMENT_ARRAY_BUFFER
             ),
         ]
         out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
-        out.set_binary_blob(bytes(positions + indices))
-    out.save_binary(str(path))
+    # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
+    document = out.gltf_to_json(separators=(",", ":"), indent=None).encode()
+    chunks = _chunk(b"JSON", document, b" ") + (
+        _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
+    )
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:
+    data += pad * (-len(data) % 4)
+    return struct.pack("<I4s", len(data), kind) + data
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401  (any JSON)
-    """A value as JSON has it: numpy's numbers as Python's, what isn't finite as null."""
+    """A value as JSON has it: numpy's numbers as Python's, what isn't finite as null (dropped from a mapping)."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):

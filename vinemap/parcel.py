@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 import time
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -167,7 +167,7 @@ def map_parcel(
         record = {
             "vinemap": __version__,
             "parcel": parcel,
-            "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "inputs": [_fingerprint(path) for path in (cloud, boundary) if path],
             "settings": settings.model_dump(mode="json"),
             "crs": points.crs.to_string(),
@@ -222,7 +222,7 @@ def _parcel_layer(
         "parcel": parcel,
         "n_rows": len(rows),
         "rows_length_m": rows["length_m"].sum(),
-        "area_m2": polygon.area,
+        "area_m2": float(shapely.area(polygon)),
         "spacing_m": rows["spacing_m"].median(),
         "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
         "gap_m": rows["gap_m"].sum(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import uuid
 from contextlib import contextmanager
@@ -51,7 +50,7 @@ def raster(folder: Path, parcel: str, kind: str) -> Path:
 
 
 def canopy_mesh(folder: Path, parcel: str) -> Path:
-    """glTF of a product."""
+    """Mesh of the canopies, as glTF."""
     return folder / f"{parcel}_canopy.glb"
 
 
@@ -105,7 +104,7 @@ def _publish(draft: Path, target: Path) -> None:
     else:
         run_record(target).unlink(missing_ok=True)
         for path in sorted(draft.iterdir(), key=lambda p: p.name == RUN):
-            os.replace(path, target / path.name)
+            path.replace(target / path.name)
 
 
 def _replaceable(target: Path, draft: Path) -> bool:

@@ -38,7 +38,7 @@ class Grid(NamedTuple):
         """Numbers of cells (ny, nx)."""
         return self.ny, self.nx
 
-    def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def centres(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Coordinates of cell centres: x (nx,) eastwards and y (ny,) southwards."""
         x = self.west + (np.arange(self.nx) + 0.5) * self.resolution
         y = self.north - (np.arange(self.ny) + 0.5) * self.resolution

@@ -20,12 +20,16 @@ if TYPE_CHECKING:
 
     from vinemap.cloud import PointCloud
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
 
 FIELD_RESOLUTION = 1.0
 """Cell size in metres of the rasters of a row field."""
 COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
+TALLEST = 40.0
+"""Metres above which nothing stands: points there are birds and noise."""
+WIDEST = 2.25
+"""Metres across which no canopy of a row is closed."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = (1, 2, 3)
@@ -66,31 +70,41 @@ def canopy_cover(
         Standard deviation in metres of the Gaussian that smooths both counts; by default the cloud's mean distance
         between points, and half a cell at the least.
     low, high : float
-        Heights in metres between which points count as canopy. What stands higher over at least a square metre
-        (trees, houses) is left out.
+        Heights in metres between which points count as canopy. What is taller (trees, houses) or wider than a row
+        of vines (huts, hedges, bushes) is left out.
     """
     grid = grid_over(cloud.xyz, resolution=resolution)
     cells = cell_of(cloud.xyz, grid)
     everything = count(cells, grid)
     canopy = count(cells[(heights >= low) & (heights <= high)], grid)
-    density = len(cells) / max(1, np.count_nonzero(everything))
+    density = len(cells) / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     blurred = gaussian_filter(everything, sigma)
     cover = gaussian_filter(canopy, sigma) / (blurred + 0.1 * density)
-    cover[_tall(cloud, heights, high, grid)] = 0.0
+    tall = count(cells[(heights > high) & (heights < TALLEST)], grid)
+    cover[_no_vines(everything, canopy, tall, resolution)] = 0.0
     return Raster(cover, grid, cloud.crs)
 
 
-def _tall(cloud: PointCloud, heights: Values, high: float, grid: Grid) -> NDArray[np.bool_]:
-    """Cells (ny, nx) of objects taller than vines, with half a metre around them."""
-    wide = coarser(grid, resolution=0.5)
-    cells = cell_of(cloud.xyz, wide)
-    above = count(cells[(heights > high) & (heights < 40)], wide)
-    tall = binary_opening(above > np.maximum(3, 0.15 * count(cells, wide)), np.ones((2, 2)))
-    tall = binary_dilation(tall, np.ones((3, 3)))
-    i, j = (np.minimum((np.arange(n) + 0.5) * grid.resolution / 0.5, m - 1).astype(int)
-            for n, m in zip(grid.shape, wide.shape, strict=True))
-    out: NDArray[np.bool_] = tall[np.ix_(i, j)]
+def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: float) -> NDArray[np.bool_]:
+    """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them.
+
+    Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
+    """
+    k = max(1, round(COVER_RESOLUTION / resolution))
+    all_, mass, above = (_blocks(values, k) for values in (everything, canopy + tall, tall))
+    high = binary_opening(above > np.maximum(2, 0.15 * all_), np.ones((3, 3)))
+    t = np.hypot(*np.mgrid[-5:6, -5:6]) * COVER_RESOLUTION
+    wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), t <= WIDEST / 2)
+    out: NDArray[np.bool_] = binary_dilation(high | wide, np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3)
+    return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
+
+
+def _blocks(values: Values, k: int) -> Values:
+    """Sums over blocks of k x k cells."""
+    ny, nx = (-(-n // k) for n in values.shape)
+    padding = [(0, ny * k - values.shape[0]), (0, nx * k - values.shape[1])]
+    out: Values = np.pad(values, padding).reshape(ny, k, nx, k).sum(axis=(1, 3))
     return out
 
 
@@ -141,8 +155,8 @@ def _block_mean(raster: Raster, resolution: float) -> Raster:
 
 def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
     """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
-    size = int(round(window / COVER_RESOLUTION / 2)) * 2
-    stride = int(round(step / COVER_RESOLUTION))
+    size = 2 * round(window / COVER_RESOLUTION / 2)
+    stride = round(step / COVER_RESOLUTION)
     # Windows reach over the edge by half their width; what lies there is no canopy.
     my, mx = (n // stride + 2 for n in cover.shape)
     padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)

@@ -46,7 +46,8 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
         In order of ``row_id``, without ``cluster``.
     """
     if len(rows) == 0:
-        return (frame.drop(columns="cluster").assign(row_id=np.empty(0, dtype=np.int64)) for frame in (rows, gaps))
+        number = np.empty(0, dtype=np.int64)
+        return rows.drop(columns="cluster").assign(row_id=number), gaps.drop(columns="cluster").assign(row_id=number)
     chords = [_chord(line) for line in rows.geometry]
     backwards = np.array([c[0] < 0 or (c[0] == 0 and c[1] < 0) for c in chords])
     lines = [shapely.reverse(g) if b else g for g, b in zip(rows.geometry, backwards, strict=True)]
@@ -125,9 +126,9 @@ def describe_rows(
     Returns
     -------
     rows : GeoDataFrame
-        With ``label``, ``length_m`` (3-D), ``orientation_deg`` (mean, anticlockwise from the west–east axis, in
-        (-90, 90]), ``elevation_m`` (mean along the row), ``elevation_diff_m`` (en − e1), ``n_key_points``, and both
-        ends as ``e1_x`` … ``en_z`` in {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
+        With ``label``, ``length_m`` (3-D), ``orientation_deg`` (mean, anticlockwise from {Main}'s west–east
+        axis, which is true and not the grid's, in (-90, 90]), ``elevation_m`` (mean along the row),
+        ``elevation_diff_m`` (en − e1), ``n_key_points``, and both ends as ``e1_x`` … ``en_z`` in {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
     row_ends : GeoDataFrame
         PointZ in EPSG:4326 with ``row_id``, ``label``, ``end`` ("e1" or "en").
     key_points : GeoDataFrame
@@ -142,7 +143,7 @@ def describe_rows(
     table = {
         "label": labels,
         "length_m": [_length(xyz) for xyz in lines],
-        "orientation_deg": [_orientation(xyz) for xyz in lines],
+        "orientation_deg": [_orientation(to_main(xyz, rows.crs, origin)) for xyz in lines],
         "elevation_m": [_mean_elevation(xyz) for xyz in lines],
         "elevation_diff_m": [float(xyz[-1, 2] - xyz[0, 2]) for xyz in lines],
         "n_key_points": np.array(n_points, dtype=np.int64),
@@ -169,7 +170,9 @@ def _key_points(rows: gpd.GeoDataFrame, labels: list[str], n_points: list[int]) 
         position = np.linspace(0, line.length, n)
         points = shapely.line_interpolate_point(line, position)
         order = np.arange(1, n + 1)
-        parts.append(pd.DataFrame({"row_id": row_id, "label": label, "order": order, "position_m": position, "p": points}))
+        parts.append(
+            pd.DataFrame({"row_id": row_id, "label": label, "order": order, "position_m": position, "p": points})
+        )
     columns = ["row_id", "label", "order", "position_m", "p"]
     table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
     return gpd.GeoDataFrame(table.drop(columns="p"), geometry=gpd.GeoSeries(list(table["p"])), crs=rows.crs)

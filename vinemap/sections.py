@@ -62,8 +62,10 @@ def cut_sections(
     order = np.lexsort((along, row))
     row, along, across, members = row[order], along[order], across[order], members[order]
 
-    parts = [_stations(line, k, gaps[gaps["row_id"] == i], step)
-             for k, (line, i) in enumerate(zip(lines, rows["row_id"], strict=True))]
+    parts = [
+        _stations(line, k, gaps[gaps["row_id"] == i], step)
+        for k, (line, i) in enumerate(zip(lines, rows["row_id"], strict=True))
+    ]
     station_row = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts)])
     position = np.concatenate(parts)
     # Rows are laid one behind the other so that one search finds the points of every section.

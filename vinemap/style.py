@@ -26,7 +26,11 @@ SYMBOLS = {
     "sections": ("line", "SimpleLine", {"line_color": "120,180,90,160", "line_width": "0.15"}),
     "row_ends": ("marker", "SimpleMarker", {"color": "255,255,255,255", "outline_color": "26,122,58,255", "size": "2"}),
     "key_points": ("marker", "SimpleMarker", {"color": "26,122,58,255", "outline_style": "no", "size": "0.9"}),
-    "parcel": ("fill", "SimpleFill", {"style": "no", "outline_color": "110,80,160,255", "outline_width": "0.5"}),
+    "parcel": (
+        "fill",
+        "SimpleFill",
+        {"style": "no", "color": "255,255,255,0", "outline_color": "110,80,160,255", "outline_width": "0.5"},
+    ),
 }
 LABELS = {"rows": "label"}
 SMALLEST_SCALE = {"sections": 600, "key_points": 2500}
@@ -76,11 +80,12 @@ def qml(layer: str, columns: list[str]) -> str:
         f'<alias field={quoteattr(column)} index="{k}" name={quoteattr(alias(column))}/>'
         for k, column in enumerate(columns, start=1)
     )
+    labelled = int(layer in LABELS)
     scale = SMALLEST_SCALE.get(layer)
     visibility = f'hasScaleBasedVisibilityFlag="1" minScale="{scale}" maxScale="0"' if scale else ""
     return (
         "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
-        f'<qgis version="3.22" styleCategories="AllStyleCategories" labelsEnabled="{int(layer in LABELS)}" {visibility}>'
+        f'<qgis version="3.22" styleCategories="AllStyleCategories" labelsEnabled="{labelled}" {visibility}>'
         '<renderer-v2 type="singleSymbol" symbollevels="0" enableorderby="0"><symbols>'
         f'<symbol type="{kind}" name="0" alpha="1" clip_to_extent="1" force_rhr="0">'
         f'<layer class="{symbol}" enabled="1" locked="0" pass="0"><Option type="Map">{options}</Option></layer>'

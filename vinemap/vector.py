@@ -47,9 +47,7 @@ LAYERS: dict[str, Layer] = {
     "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
     "sections": Layer(
         "LineString Z",
-        _ROW
-        | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL)
-        | {"n_points": WHOLE},
+        _ROW | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL) | {"n_points": WHOLE},
         "Sections across the canopy",
     ),
     "gaps": Layer(

@@ -1,0 +1,202 @@
+"""Closed pieces from sections, their volume, the GLB read back, and Open3D."""
+
+import builtins
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+import vinemap
+from vinemap.errors import DependencyError
+from vinemap.mesh import Mesh, audit, loft, merge, volume, write_glb
+
+ORIGIN = np.array([395_000.0, 4_650_000.0, 300.0])
+TURN = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+"""Z up to Y up."""
+
+
+def along(profile, length=10.0, sections=5, shift=(0.0, 0.0, 0.0)):
+    """A profile (c, 2) of (lateral, height) swept eastwards, lateral positive to the south, as a row's right is."""
+    x = np.linspace(0, length, sections)
+    flat = np.broadcast_to(np.asarray(profile, dtype=float), (sections, len(profile), 2))
+    swept = np.stack([np.broadcast_to(x[:, None], flat.shape[:2]), -flat[..., 0], flat[..., 1]], axis=2)
+    return swept + ORIGIN + shift
+
+
+SQUARE = [[0, 0], [1, 0], [1, 2], [-1, 2], [-1, 0]]
+NOTCHED = [[0, 1.5], [1, 0], [1, 2], [0.5, 2.5], [-1, 2], [-1, 0]]
+LEANING = [[0, 0], [0.1, 1], [1, 1.2], [1, 2], [-1, 2], [-1, 1.2], [-0.1, 1]]
+
+
+def area(profile):
+    y, z = np.transpose(profile)
+    return abs((y * np.roll(z, -1) - np.roll(y, -1) * z).sum()) / 2
+
+
+def closed(vertices, faces):
+    """Whether every edge is run through once in each direction."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forward = {tuple(edge) for edge in edges.tolist()}
+    return len(forward) == len(edges) and all((b, a) in forward for a, b in forward)
+
+
+@pytest.mark.parametrize("profile", [SQUARE, NOTCHED, LEANING, NOTCHED[::-1]])
+def test_a_prism_is_closed_points_outward_and_has_its_volume(profile):
+    vertices, faces = loft(along(profile))
+    c = len(profile)
+    assert vertices.shape == (5 * c, 3)
+    assert len(faces) == 2 * c * 4 + 2 * (c - 2)
+    assert closed(vertices, faces)
+    assert volume(Mesh(vertices, faces)) == pytest.approx(10 * area(profile), rel=1e-9)
+    shape = trimesh.Trimesh(vertices - ORIGIN, faces, process=False)
+    assert shape.is_watertight
+    assert shape.is_winding_consistent
+    # Each cap covers its polygon once: no triangle leaves it or turns over.
+    for end, side in ((0, -1), (10, 1)):
+        on = np.isclose(shape.triangles_center[:, 0], end)
+        assert on.sum() == c - 2
+        assert shape.area_faces[on].sum() == pytest.approx(area(profile))
+        assert (shape.face_normals[on][:, 0] * side > 0.99).all()
+
+
+def test_sides_are_equation_22():
+    _, faces = loft(along([[0, 0], [1, 0], [0, 1]], sections=3)[:, ::-1])
+    assert faces[:6].tolist() == [[0, 1, 3], [1, 2, 4], [2, 0, 5], [1, 4, 3], [2, 5, 4], [0, 3, 5]]
+    assert (faces[6:12] == faces[:6] + 3).all()
+
+
+def test_repeated_and_flat_vertices_still_close():
+    for profile in (
+        [[0, 0]] * 7,
+        [[0, 0], [1, 0], [1, 0], [1, 2], [1, 2], [-1, 2], [-1, 0]],
+        [[i, i] for i in range(7)],
+    ):
+        vertices, faces = loft(along(profile))
+        assert closed(vertices, faces)
+        assert volume(Mesh(vertices, faces)) == pytest.approx(10 * area(profile), abs=1e-6)
+
+
+def test_a_crossed_polygon_still_closes():
+    assert closed(*loft(along([[0, 0], [1, 1], [1, 0], [0, 1], [0.3, 2]])))
+
+
+@pytest.mark.parametrize("shape", [(1, 7, 3), (2, 2, 3), (5, 7, 2), (7, 3)])
+def test_too_few_sections_or_vertices_are_refused(shape):
+    with pytest.raises(ValueError, match="polygons have shape"):
+        loft(np.zeros(shape))
+
+
+def test_pieces_of_a_row_merge():
+    pieces = [loft(along(SQUARE)), loft(along(NOTCHED, length=4, shift=(20, 0, 0)))]
+    row = Mesh(*merge(pieces))
+    assert closed(row.vertices, row.faces)
+    assert volume(row) == pytest.approx(10 * area(SQUARE) + 4 * area(NOTCHED))
+    assert trimesh.Trimesh(row.vertices, row.faces).body_count == 2
+    empty = Mesh(*merge([]))
+    assert (empty.vertices.shape, empty.faces.shape, volume(empty)) == ((0, 3), (0, 3), 0)
+
+
+# glTF
+
+
+def rows():
+    number = {"length_m": np.float64(10), "gap_m": np.nan, "n_key_points": np.int64(5), "ends": np.array([1.5, np.inf])}
+    return [
+        Mesh(*loft(along(SQUARE)), row_id=1, label="1 F", extras=number),
+        Mesh(*merge([loft(along(NOTCHED, shift=(0, 2.5, 1))), loft(along(SQUARE, shift=(90, 2.5, 1)))]), 2, "2 F"),
+        Mesh(*merge([]), row_id=3, label="3 F"),
+    ]
+
+
+def read(path):
+    data = path.read_bytes()
+    magic, version, length = struct.unpack("<4sII", data[:12])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size = struct.unpack("<I", data[12:16])[0]
+    return json.loads(data[20 : 20 + size], parse_constant=pytest.fail)
+
+
+def test_glb_has_a_node_a_row_with_its_numbers(tmp_path):
+    path = tmp_path / "F_canopy.glb"
+    write_glb(rows(), path, origin=ORIGIN, crs="EPSG:32632", extras={"vertical": "EGM2008 height", "quality": np.nan})
+    document = read(path)
+    root, *nodes = document["nodes"]
+    assert root["extras"] == {"crs": "EPSG:32632", "vertical": "EGM2008 height", "origin": ORIGIN.tolist()}
+    assert [node["name"] for node in nodes] == ["1 F", "2 F", "3 F"]
+    assert nodes[0]["extras"] == {"row_id": 1, "length_m": 10.0, "n_key_points": 5, "ends": [1.5, None]}
+    assert "mesh" not in nodes[2]
+    assert document["asset"]["generator"] == f"vinemap {vinemap.__version__}"
+    assert [m["doubleSided"] for m in document["materials"]] == [False]
+
+
+def test_glb_reads_back_in_metres_y_up(tmp_path):
+    path = tmp_path / "F_canopy.glb"
+    write_glb(rows(), path, origin=ORIGIN, crs="EPSG:32632")
+    scene = trimesh.load(path)
+    assert set(scene.graph.nodes_geometry) == {"1 F", "2 F"}
+    for row in rows()[:2]:
+        transform, name = scene.graph[row.label]
+        shape = scene.geometry[name].copy()
+        shape.apply_transform(transform)
+        assert shape.is_watertight
+        assert shape.volume == pytest.approx(volume(row), rel=1e-5)
+        expected = trimesh.transform_points(row.vertices - ORIGIN, TURN)
+        np.testing.assert_allclose(shape.bounds, [expected.min(axis=0), expected.max(axis=0)], atol=1e-5)
+
+
+def test_rows_of_the_same_faces_share_them(tmp_path):
+    meshes = [Mesh(*loft(along(SQUARE, shift=(0, 2.5 * i, 0))), row_id=i, label=f"{i} F") for i in range(3)]
+    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    document = read(tmp_path / "a.glb")
+    assert len({mesh["primitives"][0]["indices"] for mesh in document["meshes"]}) == 1
+
+
+def test_more_than_65535_vertices_take_wide_indices(tmp_path):
+    mesh = Mesh(*loft(along(LEANING, length=3000, sections=9400)), row_id=1, label="1 F")
+    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    document = read(tmp_path / "a.glb")
+    assert document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]["componentType"] == 5125
+
+
+def test_no_rows_give_a_root_alone(tmp_path):
+    write_glb([], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    document = read(tmp_path / "a.glb")
+    assert len(document["nodes"]) == 1
+    assert "meshes" not in document
+
+
+# Open3D
+
+
+def test_open3d_finds_pieces_watertight_and_broken_ones_not():
+    row = Mesh(*merge([loft(along(SQUARE)), loft(along(NOTCHED, shift=(20, 0, 0)))]))
+    try:
+        result = audit(row)
+    except DependencyError as error:
+        pytest.skip(str(error))
+    assert result == (True, True, False, pytest.approx(10 * (area(SQUARE) + area(NOTCHED))))
+    assert not audit(Mesh(row.vertices, row.faces[1:])).watertight
+    assert np.isnan(audit(Mesh(row.vertices, row.faces[1:])).volume)
+    crossing = merge([loft(along(SQUARE)), loft(along(SQUARE, shift=(5, 0.5, 0.5)))])
+    assert audit(Mesh(*crossing)).self_intersecting
+
+
+@pytest.mark.parametrize("failure", [ImportError("No module named 'open3d'"), OSError("libusb-1.0.so.0: cannot open")])
+def test_without_open3d_the_error_says_what_to_install(monkeypatch, failure):
+    real = builtins.__import__
+
+    def fails(name, *args, **kwargs):
+        if name == "open3d":
+            raise failure
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", fails)
+    with pytest.raises(DependencyError) as caught:
+        audit(Mesh(*loft(along(SQUARE))))
+    message = str(caught.value)
+    assert str(failure) in message
+    assert "apt-get install libegl1 libgl1 libusb-1.0-0" in message
+    assert "pip install open3d-cpu" in message
+    assert "\n" not in message

@@ -1,0 +1,155 @@
+"""The whole chain on small vineyards: products, their contract, and what is left when something is wrong."""
+
+import json
+
+import geopandas as gpd
+import numpy as np
+import pygltflib
+import pyogrio
+import pytest
+import rasterio
+import shapely
+import trimesh
+
+from vinemap import paths
+from vinemap.crs import Origin, main_to_wgs84
+from vinemap.errors import InputError, OutputError
+from vinemap.evaluate import evaluate_rows
+from vinemap.mesh import volume
+from vinemap.parcel import STAGES, call, map_parcel
+from vinemap.synthetic import Obstacle, hillside, simulate, write_survey
+from vinemap.vector import LAYERS
+
+
+@pytest.fixture(scope="module")
+def survey(vineyard, tmp_path_factory):
+    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
+
+
+@pytest.fixture(scope="module")
+def product(survey, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("products") / "A"
+    boundary = survey.parent / "parcels.gpkg"
+    named = []
+
+    def step(name, function, *args, **kwargs):
+        named.append(name)
+        return call(name, function, *args, **kwargs)
+
+    summary = map_parcel(survey, folder, parcel="A", boundary=boundary, origin=Origin(44.6, 7.9, 250.0), step=step)
+    assert tuple(named) == STAGES
+    return summary
+
+
+def test_rows_are_found_where_they_are(product, vineyard):
+    found = evaluate_rows(gpd.read_file(paths.geopackage(product.folder, "A"), layer="rows"), vineyard.rows)
+    assert (found.good, found.extra, found.missed) == (100, 0, 0)
+    assert found.dep.mean < 0.08
+    assert found.dek.mean < 0.02
+    assert found.cof.mean < 0.02
+    assert np.abs(found.pairs[["e1_along_m", "en_along_m"]].to_numpy().mean()) < 0.04
+    assert product.rows == 6
+
+
+def test_missing_vines_are_gaps(product, vineyard):
+    gaps = gpd.read_file(paths.geopackage(product.folder, "A"), layer="gaps")
+    dead = vineyard.dead_vines
+    run = ((dead["row"] != dead["row"].shift()) | (dead["vine"] != dead["vine"].shift() + 1)).cumsum()
+    runs = dead[run.map(run.value_counts()) >= 2]
+    assert runs.distance(gaps.union_all()).max() < 0.5
+    long = gaps[gaps["length_m"] > 1.5]
+    assert long.distance(dead.union_all()).max() < 0.5
+
+
+def test_product_is_the_contracts(product):
+    folder = product.folder
+    record = json.loads((folder / "run.json").read_text())
+    expected = {"A.gpkg", "A_canopy.glb", *(f"A_{kind}.tif" for kind in paths.RASTERS)}
+    assert {p.name for p in folder.iterdir()} == expected | {"run.json"}
+    assert set(record["files"]) == expected
+    assert record["origin"] == {"lat": 44.6, "lon": 7.9, "alt": 250.0}
+    assert record["counts"]["rows"] == 6
+    assert len(record["inputs"][0]["sha256"]) == 64
+    assert set(record["seconds"]) == {*STAGES, "All"}
+    assert record["settings"]["polygon"]["c"] == 7
+    assert [p.name for p in folder.parent.iterdir()] == ["A"]
+    listed = [str(name) for name, _ in pyogrio.list_layers(folder / "A.gpkg")]
+    assert listed == [*LAYERS, "layer_styles"]
+
+
+def test_table_2_1_holds_together(product):
+    rows = gpd.read_file(paths.geopackage(product.folder, "A"), layer="rows")
+    assert list(rows["label"]) == [f"{k} A" for k in range(1, 7)]
+    ends = np.array([shapely.get_coordinates(g, include_z=True)[[0, -1]] for g in rows.geometry])
+    for k, end in enumerate(("e1", "en")):
+        wgs84 = rows[[f"{end}_lat", f"{end}_lon", f"{end}_alt"]].to_numpy()
+        main = rows[[f"{end}_x", f"{end}_y", f"{end}_z"]].to_numpy()
+        assert np.allclose(main_to_wgs84(main, Origin(44.6, 7.9, 250.0)), wgs84, rtol=0, atol=1e-8)
+        points = gpd.GeoSeries(gpd.points_from_xy(wgs84[:, 1], wgs84[:, 0]), crs=4326).to_crs(rows.crs)
+        assert np.allclose(points.get_coordinates(), ends[:, k, :2], atol=0.002)
+    assert np.allclose(rows["elevation_diff_m"], ends[:, 1, 2] - ends[:, 0, 2])
+    assert rows["orientation_deg"].to_numpy() == pytest.approx(33 + 0.75, abs=0.5)
+    assert rows["spacing_m"].to_numpy() == pytest.approx(2.5, rel=0.03)
+    assert rows["height_m"].between(1.6, 2.3).all()
+    assert rows["width_m"].between(0.4, 0.8).all()
+    assert (rows["volume_m3"] > 8).all()
+
+
+def test_rasters(product):
+    for kind in paths.RASTERS:
+        with rasterio.open(paths.raster(product.folder, "A", kind)) as src:
+            assert src.crs.to_epsg() == 32632
+            assert src.nodata == -9999
+            assert src.units[0]
+            assert src.descriptions[0]
+    with rasterio.open(paths.raster(product.folder, "A", "row_direction")) as src:
+        assert np.median(src.read(1, masked=True).compressed()) == pytest.approx(33, abs=1.5)
+    with rasterio.open(paths.raster(product.folder, "A", "vineyard_likelihood")) as src:
+        likelihood = src.read(1, masked=True)
+        assert 0 <= likelihood.min() <= likelihood.max() <= 1
+
+
+def test_meshes_are_closed_named_and_in_place(product):
+    path = paths.canopy_mesh(product.folder, "A")
+    scene = trimesh.load(path)
+    assert sorted(scene.graph.nodes_geometry) == [f"{k} A" for k in range(1, 7)]
+    assert all(g.is_watertight and g.volume > 0 for g in scene.geometry.values())
+    rows = gpd.read_file(paths.geopackage(product.folder, "A"), layer="rows")
+    total = sum(g.volume for g in scene.geometry.values())
+    assert total == pytest.approx(rows["volume_m3"].sum(), rel=0.05)
+    low, high = scene.bounds
+    assert 2 < (high - low)[1] < 12
+    gltf = pygltflib.GLTF2().load(path)
+    origin = np.array(gltf.nodes[0].extras["origin"])
+    west, south, east, north = rows.total_bounds
+    assert low[[0]] + origin[0] == pytest.approx(west, abs=0.6)
+    assert -low[2] + origin[1] == pytest.approx(north, abs=0.6)
+    assert high[0] + origin[0] == pytest.approx(east, abs=0.6)
+    assert -high[2] + origin[1] == pytest.approx(south, abs=0.6)
+    node = next(n for n in gltf.nodes if n.name == "3 A")
+    assert node.extras["length_m"] == pytest.approx(rows.set_index("row_id")["length_m"][3])
+    assert callable(volume)
+
+
+def test_nothing_is_a_product_of_empty_layers(tmp_path):
+    x, y = 414700.0, 4940750.0
+    survey = simulate([], hillside(0.1), obstacles=[Obstacle(x, y, 2, 2, 5, 1)], seed=1, name="meadow", density=100)
+    summary = map_parcel(write_survey(survey, tmp_path / "in"), tmp_path / "out", parcel="meadow")
+    assert summary.rows == 0
+    assert "no vine row found" in summary.line()
+    for layer, contract in LAYERS.items():
+        frame = gpd.read_file(paths.geopackage(tmp_path / "out", "meadow"), layer=layer)
+        assert [c for c in frame.columns if c != "geometry"] == list(contract.columns)
+        assert len(frame) == (1 if layer == "parcel" else 0)
+    for kind in paths.RASTERS:
+        assert paths.raster(tmp_path / "out", "meadow", kind).is_file()
+    assert len(pygltflib.GLTF2().load(paths.canopy_mesh(tmp_path / "out", "meadow")).nodes) == 1
+
+
+def test_bad_input_leaves_nothing(tmp_path, survey):
+    with pytest.raises(InputError):
+        map_parcel(tmp_path / "none.laz", tmp_path / "out", parcel="A")
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError):
+        map_parcel(survey, tmp_path / "file" / "out", parcel="A")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
