@@ -1,5 +1,6 @@
 """Prefect flows that chain the stages of vinemap."""
 
+import logging
 import os
 
 # Prefect reads these when it is first imported. Its log goes to its own server; the terminal shows ours.
@@ -7,3 +8,5 @@ os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_LOGGING_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
+# Prefect gives every library's log to the terminal; what laspy has to say is in our own error.
+logging.getLogger("laspy").setLevel(logging.CRITICAL)

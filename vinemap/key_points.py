@@ -64,7 +64,7 @@ def detect_key_points(
         PointZ with columns ``cover`` (0–1), ``direction_deg`` and ``spacing_m`` of the field there.
     """
     nodes = _nodes(field, cover.grid, grid_step, min_likelihood)
-    found = [np.empty((0, 5))]
+    found: list[Values] = [np.empty((0, 5))]
     for start in range(0, len(nodes), BATCH):
         batch = nodes[start : start + BATCH]
         # Beyond its reach a profile goes on for what the Gaussian needs.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,6 +72,7 @@ def product(target: Path) -> Iterator[Path]:
         If nothing can be written there.
     """
     draft = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
+    made = [folder for folder in target.parents if not folder.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         draft.mkdir()
@@ -87,6 +88,9 @@ def product(target: Path) -> Iterator[Path]:
         raise _unwritable(target, error) from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+        for folder in made:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def _unwritable(target: Path, error: OSError) -> OutputError:

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import rfft2
-from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, map_coordinates, maximum_filter
+from scipy.ndimage import (
+    binary_dilation,
+    binary_opening,
+    gaussian_filter,
+    map_coordinates,
+    maximum_filter,
+    uniform_filter,
+)
 
 from vinemap.raster import Grid, Raster, RowField, cell_of, coarser, count, grid_over
 
@@ -92,8 +99,9 @@ def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: floa
     Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
     """
     k = max(1, round(COVER_RESOLUTION / resolution))
-    all_, mass, above = (_blocks(values, k) for values in (everything, canopy + tall, tall))
-    high = binary_opening(above > np.maximum(2, 0.15 * all_), np.ones((3, 3)))
+    # Summed over 0.75 m, so that a sparse cloud is judged by more than a point or two.
+    all_, mass, above = (9 * uniform_filter(_blocks(v, k), 3) for v in (everything, canopy + tall, tall))
+    high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
     t = np.hypot(*np.mgrid[-5:6, -5:6]) * COVER_RESOLUTION
     wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), t <= WIDEST / 2)
     out: NDArray[np.bool_] = binary_dilation(high | wide, np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3)

@@ -128,7 +128,8 @@ def describe_rows(
     rows : GeoDataFrame
         With ``label``, ``length_m`` (3-D), ``orientation_deg`` (mean, anticlockwise from {Main}'s west–east
         axis, which is true and not the grid's, in (-90, 90]), ``elevation_m`` (mean along the row),
-        ``elevation_diff_m`` (en − e1), ``n_key_points``, and both ends as ``e1_x`` … ``en_z`` in {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
+        ``elevation_diff_m`` (en − e1), ``n_key_points``, and both ends as ``e1_x`` … ``en_z`` in
+        {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
     row_ends : GeoDataFrame
         PointZ in EPSG:4326 with ``row_id``, ``label``, ``end`` ("e1" or "en").
     key_points : GeoDataFrame

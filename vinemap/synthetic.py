@@ -11,6 +11,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,8 @@ Terrain = Callable[[Array, Array], Array]
 PLACE = (414750.0, 4940780.0)
 """Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
 TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
+MADE = date(2019, 6, 1)
+"""Date that a simulated cloud states, so that the same survey is the same file on any day."""
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6
 """How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
@@ -410,6 +413,7 @@ def write_survey(survey: Survey, folder: Path | str) -> Path:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(survey.xyz.min(axis=0))
+    header.creation_date = MADE
     header.add_crs(survey.rows.crs)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = survey.xyz.T

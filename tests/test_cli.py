@@ -1,0 +1,128 @@
+"""Commands as a person types them: results, and one line for everything that can be wrong."""
+
+import os
+import subprocess
+import sys
+import time
+
+import geopandas as gpd
+import laspy
+import numpy as np
+import pytest
+import shapely
+
+from vinemap.synthetic import write_survey
+
+VINEMAP = [sys.executable, "-m", "vinemap.cli"]
+
+
+@pytest.fixture(scope="module")
+def survey(vineyard, tmp_path_factory):
+    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
+
+
+def vinemap(*args, cwd):
+    return subprocess.run(
+        [*VINEMAP, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def assert_refused(done, *words):
+    """One line on stderr that says what was wrong, exit code 2, nothing on stdout."""
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("vinemap: ")
+    assert done.stderr.count("\n") == 1
+    for word in words:
+        assert word in done.stderr
+    assert done.stdout == ""
+
+
+def test_run_and_evaluate(tmp_path, survey):
+    truth = survey.parent / "truth.gpkg"
+    done = vinemap("run", survey, "--boundary", survey.parent / "parcels.gpkg", "--parcel", "A", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.startswith("A: 6 rows, ")
+    folder = tmp_path / "data" / "products" / "small" / "A"
+    assert (folder / "run.json").is_file()
+    done = vinemap("evaluate", folder / "A.gpkg", truth, cwd=tmp_path)
+    assert done.returncode == 0
+    assert "good 100.0%, extra 0.0%, missed 0.0%" in done.stdout
+
+
+def test_settings_and_names_from_the_command_line(tmp_path, survey):
+    (tmp_path / "s.yaml").write_text("sections: {step: 1.0}\ncurves: {min_length: 100}\n")
+    out = tmp_path / "x" / "y"
+    done = vinemap("run", survey, "--settings", "s.yaml", "--out", out, "--origin", "44.6,7.9,250", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "small: no vine row found" in done.stdout
+    assert (out / "small.gpkg").is_file()
+
+
+def test_start_is_quick(tmp_path):
+    """Far from the 3 s that a start may take, so that a slow machine doesn't fail it; run.py imports come later."""
+    start = time.perf_counter()
+    assert vinemap("--version", cwd=tmp_path).returncode == 0
+    assert time.perf_counter() - start < 3
+
+
+def test_bad_clouds(tmp_path, survey):
+    whole = survey.read_bytes()
+    (tmp_path / "cut.laz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.laz").write_text("no cloud")
+    for path, word in (("none.laz", "no such file"), ("cut.laz", "cut.laz"), ("text.laz", "text.laz")):
+        assert_refused(vinemap("run", path, "--out", "out", cwd=tmp_path), path, word)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cut.laz", "text.laz"]
+
+
+def test_no_crs(tmp_path):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, 0.001)
+    las = laspy.LasData(header)
+    las.xyz = np.random.default_rng(0).uniform([1000, 1000, 0], [1020, 1020, 2], (100, 3))
+    las.write(tmp_path / "bare.las")
+    assert_refused(vinemap("run", "bare.las", cwd=tmp_path), "bare.las", "--crs")
+    assert_refused(vinemap("run", "bare.las", "--crs", "EPSG:99", cwd=tmp_path), "EPSG:99")
+
+
+def test_bad_boundaries(tmp_path, survey):
+    away = gpd.GeoDataFrame(geometry=[shapely.box(0, 0, 1, 1)], crs=32632)
+    away.to_file(tmp_path / "away.gpkg")
+    assert_refused(vinemap("run", survey, "--boundary", "away.gpkg", cwd=tmp_path), "boundary", survey.name)
+    assert_refused(vinemap("run", survey, "--boundary", "none.gpkg", cwd=tmp_path), "none.gpkg: no such file")
+    assert [p.name for p in tmp_path.iterdir()] == ["away.gpkg"]
+
+
+@pytest.mark.parametrize("name", ["../F", "a/b", ""])
+def test_parcel_names_with_characters_of_paths(tmp_path, survey, name):
+    assert_refused(vinemap("run", survey, "--parcel", name, cwd=tmp_path), "can't name a file")
+
+
+def test_bad_settings(tmp_path, survey):
+    (tmp_path / "s.yaml").write_text("ground: {resolution: 50}\n")
+    done = vinemap("run", survey, "--settings", "s.yaml", cwd=tmp_path)
+    assert_refused(done, "s.yaml", "ground.resolution = 50", "less than or equal to 2")
+
+
+def test_folder_that_cannot_be_written(tmp_path, survey):
+    (tmp_path / "file").write_text("x")
+    assert_refused(vinemap("run", survey, "--out", "file/out", cwd=tmp_path), "file/out", "can't be written")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_wrong_words(tmp_path):
+    assert_refused(vinemap("run", cwd=tmp_path), "Missing argument 'CLOUD'")
+    assert_refused(vinemap("run", "a.laz", "--origin", "north", cwd=tmp_path), "latitude, longitude and altitude")
+    assert_refused(vinemap("fly", cwd=tmp_path), "fly")
+
+
+def test_faults_are_one_line_too(tmp_path):
+    code = "from vinemap import cli\nwith cli.plain_errors():\n    raise ZeroDivisionError('oops')\n"
+    environment = {k: v for k, v in os.environ.items() if k != "VINEMAP_TRACEBACK"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "ZeroDivisionError: oops" in done.stderr
+    environment["VINEMAP_TRACEBACK"] = "1"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert "Traceback" in done.stderr
