@@ -223,6 +223,14 @@ def test_read_lines_finds_the_layer(tmp_path):
     assert len(read_lines(str(path))) == 2
 
 
+def test_read_lines_of_one_parcel(tmp_path):
+    path = tmp_path / "lines.gpkg"
+    REFERENCE.assign(parcel=["G", *["H"] * (len(REFERENCE) - 1)]).to_file(path, layer="rows")
+    assert len(read_lines(path, parcel="G")) == 1
+    with pytest.raises(InputError, match="'X'"):
+        read_lines(path, parcel="X")
+
+
 def test_read_lines_of_an_empty_layer(tmp_path):
     path = tmp_path / "nothing.gpkg"
     frame().to_file(path, layer="drawn", geometry_type="Unknown")

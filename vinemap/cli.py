@@ -82,11 +82,13 @@ def run(
 @commands.command()
 @click.argument("result", type=FILE)
 @click.argument("reference", type=FILE)
-def evaluate(result: Path, reference: Path) -> None:
+@click.option("--layer", help="Layer of REFERENCE; rows, or its only layer of lines, by default.")
+@click.option("--parcel", help="Only the lines of REFERENCE in which a column holds this name.")
+def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
     from vinemap.evaluate import evaluate_rows, format_table, read_lines  # noqa: PLC0415
 
-    click.echo(format_table(evaluate_rows(read_lines(result), read_lines(reference))))
+    click.echo(format_table(evaluate_rows(read_lines(result), read_lines(reference, layer, parcel=parcel))))
 
 
 @contextmanager

@@ -70,7 +70,7 @@ class Evaluation(NamedTuple):
     """Area between the curves over the reference's length (index 6)."""
 
 
-def read_lines(path: str | Path, layer: str | None = None) -> gpd.GeoDataFrame:
+def read_lines(path: str | Path, layer: str | None = None, *, parcel: str | None = None) -> gpd.GeoDataFrame:
     """Read the lines of a vector file.
 
     Parameters
@@ -79,11 +79,14 @@ def read_lines(path: str | Path, layer: str | None = None) -> gpd.GeoDataFrame:
         GeoPackage, GeoJSON, Shapefile or whatever else GDAL reads.
     layer : str, optional
         Layer to read; else ``rows``, else the only layer of lines.
+    parcel : str, optional
+        Keep the lines in which a column holds this name.
 
     Raises
     ------
     InputError
-        If the file can't be read, or the layer isn't there, isn't the only one, or isn't one of lines.
+        If the file can't be read, or the layer isn't there, isn't the only one, or isn't one of lines; or if no line
+        has the parcel's name.
     """
     path = Path(path)
     if not path.exists():
@@ -99,7 +102,12 @@ def read_lines(path: str | Path, layer: str | None = None) -> gpd.GeoDataFrame:
     kinds = set(lines.geom_type.dropna()) if isinstance(lines, gpd.GeoDataFrame) else {"no geometry"}
     if other := sorted(kinds - {"LineString", "MultiLineString"}):
         raise InputError(f"{path}: layer {layer} holds {', '.join(other)}; give a layer of lines, one a vine row")
-    return lines
+    if parcel is None:
+        return lines
+    named = lines[(lines.drop(columns="geometry").astype(str) == parcel).any(axis=1)]
+    if len(named) == 0:
+        raise InputError(f"{path}: no line of layer {layer} has {parcel!r} in a column: check the parcel's name")
+    return named
 
 
 def _line_layer(path: Path, layer: str | None) -> str:
