@@ -19,10 +19,10 @@ def write(tmp_path):
 
 
 def test_survey_with_settings(write):
-    config = load_survey(write(SURVEY + "origin: [44.6, 7.9, 428.7]\nsettings:\n  curves: {smoothing: 5}\n"))
+    config = load_survey(write(SURVEY + "origin: [44.6, 7.9, 428.7]\nsettings:\n  fit: {smoothing: 5}\n"))
     assert config.parcels == ["F", "curved", "blocks"]
     assert config.origin.lat == 44.6
-    assert config.settings.curves.smoothing == 5
+    assert config.settings.fit.smoothing == 5
     assert config.settings.ground == Settings().ground
 
 
@@ -90,7 +90,7 @@ def test_defaults_of_settings_are_those_of_the_stages():
     """A stage called without options works as one called with the default settings."""
     import inspect
 
-    from vinemap import canopy, clustering, curves, ground, key_points, row_field, sections
+    from vinemap import canopy, clustering, curves, ground, key_points, row_field, row_fit, sections
 
     stages = {
         "ground": ground.terrain_model,
@@ -99,10 +99,12 @@ def test_defaults_of_settings_are_those_of_the_stages():
         "key_points": key_points.detect_key_points,
         "clustering": clustering.cluster_rows,
         "curves": curves.trace_rows,
+        "fit": row_fit.fit_rows,
         "sections": sections.cut_sections,
         "canopy": canopy.separate_canopy,
     }
     for name, options in Settings().model_dump().items():
         if name in stages:
             parameters = inspect.signature(stages[name]).parameters.values()
-            assert options == {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}, name
+            defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+            assert defaults == options | {k: Settings().cover.model_dump()[k] for k in defaults if k not in options}

@@ -19,11 +19,11 @@ TABLE = pd.read_csv(Path(__file__).parents[1] / "data" / "table_2_1.csv")
 
 def frame(lines, spacing=2.5):
     geometry = [shapely.LineString(np.column_stack([c, np.zeros(len(c))])) for c in lines]
-    return gpd.GeoDataFrame({"cluster": np.arange(len(lines)) * 7, "spacing_m": spacing}, geometry=geometry, crs=UTM)
+    return gpd.GeoDataFrame({"spacing_m": [spacing] * len(lines)}, geometry=geometry, crs=UTM)
 
 
 def no_gaps():
-    columns = {c: np.empty(0) for c in ("cluster", "start_m", "end_m", "length_m")}
+    columns = {c: np.empty(0) for c in ("row", "start_m", "end_m", "length_m")}
     return gpd.GeoDataFrame(columns, geometry=[], crs=UTM)
 
 
@@ -63,7 +63,7 @@ def test_blocks_follow_each_other():
 def test_gaps_turn_with_their_row():
     line = np.array([[30.0, 0], [0, 0]])
     gap = gpd.GeoDataFrame(
-        {"cluster": [0], "start_m": [5.0], "end_m": [8.0], "length_m": [3.0]},
+        {"row": [0], "start_m": [5.0], "end_m": [8.0], "length_m": [3.0]},
         geometry=[shapely.LineString([[25, 0, 0], [22, 0, 0]])],
         crs=UTM,
     )
@@ -79,7 +79,7 @@ def test_table_2_1_comes_back():
     lines = [shapely.LineString([a, b]) for a, b in zip(e1, en, strict=True)]
     order = np.random.default_rng(0).permutation(16)
     scrambled = gpd.GeoDataFrame(
-        {"cluster": order, "spacing_m": 2.6}, geometry=[shapely.reverse(lines[k]) for k in order], crs=UTM
+        {"spacing_m": [2.6] * 16}, geometry=[shapely.reverse(lines[k]) for k in order], crs=UTM
     )
     rows, ends, points = describe_rows(number_rows(scrambled, no_gaps())[0], parcel="F", origin=ORIGIN)
     assert list(rows["label"]) == [f"{k} F" for k in range(1, 17)]
@@ -119,7 +119,7 @@ def test_length_is_three_dimensional_and_elevation_a_mean_along_the_row():
 
 
 def test_no_rows():
-    empty = gpd.GeoDataFrame({"cluster": np.empty(0, int), "spacing_m": np.empty(0)}, geometry=[], crs=UTM)
+    empty = gpd.GeoDataFrame({"spacing_m": np.empty(0)}, geometry=[], crs=UTM)
     rows, gaps = number_rows(empty, no_gaps())
     rows, ends, points = describe_rows(rows, parcel="A", origin=ORIGIN)
     assert len(rows) == len(gaps) == len(ends) == len(points) == 0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from vinemap.cloud import Sections
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
     Flags = NDArray[np.bool_]
 
 BIN = 0.05

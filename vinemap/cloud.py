@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    Values = NDArray[np.float64]
+    Values = NDArray[np.floating]
 
 CHUNK = 1_000_000
 LARGEST_SPAN = 50_000.0

@@ -91,16 +91,21 @@ class ClusteringOptions(Options):
 
 
 class CurveOptions(Options):
-    """Curves, ends and gaps of rows."""
+    """Courses of rows."""
 
     threshold: Metres = Field(2.0, description="distance t of the enhanced key points (m)")
-    smoothing: Metres = Field(3.0, description="wavelength below which bends are noise (m)")
-    end_share: float = Field(0.5, gt=0, lt=1, description="share of the median cover at which canopy ends")
-    min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
     min_length: Metres = Field(4.0, description="length of a row (m)")
     min_radius: Metres = Field(8.0, description="radius of the tightest bend (m)")
     max_width: Metres = Field(1.6, description="width of a row's canopy (m)")
     min_support: Share = Field(0.25, description="share of a row's length that has canopy")
+
+
+class FitOptions(Options):
+    """Centre lines, ends and gaps of rows."""
+
+    smoothing: Metres = Field(3.0, description="wavelength below which bends are noise (m)")
+    end_share: float = Field(0.5, gt=0, lt=1, description="share of the median cover at which canopy ends")
+    min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
 
 
 class SectionOptions(Options):
@@ -138,6 +143,7 @@ class Settings(Options):
     key_points: KeyPointOptions = KeyPointOptions()
     clustering: ClusteringOptions = ClusteringOptions()
     curves: CurveOptions = CurveOptions()
+    fit: FitOptions = FitOptions()
     sections: SectionOptions = SectionOptions()
     canopy: CanopyOptions = CanopyOptions()
     polygon: PolygonOptions = PolygonOptions()

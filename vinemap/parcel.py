@@ -27,6 +27,7 @@ from vinemap.key_points import detect_key_points
 from vinemap.mesh import Mesh, write_glb
 from vinemap.raster import Raster, RowField, write_cog
 from vinemap.row_field import canopy_cover, estimate_row_field
+from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.sections import cut_sections
 from vinemap.vector import read_boundary, write_geopackage
@@ -50,6 +51,7 @@ STAGES = (
     "Key points",
     "Clusters",
     "Curves",
+    "Ends and gaps",
     "Sections",
     "Canopy",
     "Mesh",
@@ -141,7 +143,10 @@ def map_parcel(
         field = run("Row field", estimate_row_field, cover, **options("row_field"))
         key_points = run("Key points", detect_key_points, cover, dtm, field, **options("key_points"))
         clusters = run("Clusters", cluster_rows, key_points, **options("clustering"))
-        rows, gaps = number_rows(*run("Curves", trace_rows, clusters, cover, dtm, **options("curves")))
+        courses = run("Curves", trace_rows, clusters, cover, **options("curves"))
+        limits = {"low": settings.cover.low, "high": settings.cover.high}
+        fitted = run("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options("fit"))
+        rows, gaps = number_rows(*fitted)
         sections = run("Sections", cut_sections, points, heights, rows, gaps, dtm, **options("sections"))
         canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
         origin = origin or _corner(dtm)

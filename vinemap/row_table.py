@@ -36,18 +36,18 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     Parameters
     ----------
     rows : GeoDataFrame
-        LineStringZ with ``cluster`` and ``spacing_m``.
+        LineStringZ with ``spacing_m``.
     gaps : GeoDataFrame
-        LineStringZ with ``cluster``, ``start_m``, ``end_m`` and ``length_m``.
+        LineStringZ with ``row`` (position in rows), ``start_m``, ``end_m`` and ``length_m``.
 
     Returns
     -------
     rows, gaps : GeoDataFrame
-        In order of ``row_id``, without ``cluster``.
+        In order of ``row_id``; gaps without ``row``.
     """
     if len(rows) == 0:
         number = np.empty(0, dtype=np.int64)
-        return rows.drop(columns="cluster").assign(row_id=number), gaps.drop(columns="cluster").assign(row_id=number)
+        return rows.assign(row_id=number), gaps.drop(columns="row").assign(row_id=number)
     chords = [_chord(line) for line in rows.geometry]
     backwards = np.array([c[0] < 0 or (c[0] == 0 and c[1] < 0) for c in chords])
     lines = [shapely.reverse(g) if b else g for g, b in zip(rows.geometry, backwards, strict=True)]
@@ -55,7 +55,7 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     rank = np.empty(len(rows), dtype=np.int64)
     rank[_order_across(rows)] = np.arange(1, len(rows) + 1)
 
-    index = pd.Index(rows["cluster"]).get_indexer(gaps["cluster"])
+    index = gaps["row"].to_numpy(dtype=np.int64)
     turned = backwards[index]
     length = shapely.length(shapely.force_2d(rows.geometry.to_numpy()))[index]
     start = np.where(turned, length - gaps["end_m"], gaps["start_m"])
@@ -64,8 +64,8 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     gaps = gaps.assign(row_id=rank[index], start_m=start, end_m=end)
     gaps = gaps.set_geometry(gpd.GeoSeries(pieces, index=gaps.index, crs=rows.crs))
     return (
-        rows.assign(row_id=rank).drop(columns="cluster").sort_values("row_id", ignore_index=True),
-        gaps.drop(columns="cluster").sort_values(["row_id", "start_m"], ignore_index=True),
+        rows.assign(row_id=rank).sort_values("row_id", ignore_index=True),
+        gaps.drop(columns="row").sort_values(["row_id", "start_m"], ignore_index=True),
     )
 
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
 
 from vinemap.cloud import Sections
-from vinemap.raster import cell_of, grid_over, sample
+from vinemap.raster import sample
+from vinemap.row_frame import row_coordinates, tangents
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -18,10 +18,7 @@ if TYPE_CHECKING:
     from vinemap.cloud import PointCloud
     from vinemap.raster import Raster
 
-    Values = NDArray[np.float64]
-
-GUIDE = 0.25
-"""Metres between the points of γ to which cloud points are referred, and the cells of their lookup."""
+    Values = NDArray[np.floating]
 
 
 def cut_sections(
@@ -58,19 +55,17 @@ def cut_sections(
         start = np.zeros(1, dtype=np.int64)
         return Sections(number, none, np.empty((0, 3)), pairs, none, start, pairs, none)
     lines = [shapely.force_2d(line) for line in rows.geometry]
-    row, along, across, members = _row_coordinates(cloud.xyz, lines, 0.5 * rows["spacing_m"].to_numpy())
-    order = np.lexsort((along, row))
-    row, along, across, members = row[order], along[order], across[order], members[order]
+    curves = [shapely.get_coordinates(line) for line in lines]
+    near = row_coordinates(cloud.xyz, curves, 0.5 * rows["spacing_m"].to_numpy())
+    order = np.lexsort((near.along, near.row))
+    left, member = near.left[order], near.member[order]
 
-    parts = [
-        _stations(line, k, gaps[gaps["row_id"] == i], step)
-        for k, (line, i) in enumerate(zip(lines, rows["row_id"], strict=True))
-    ]
+    parts = [_stations(line, gaps[gaps["row_id"] == i], step) for line, i in zip(lines, rows["row_id"], strict=True)]
     station_row = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts)])
     position = np.concatenate(parts)
     # Rows are laid one behind the other so that one search finds the points of every section.
     stride = max(line.length for line in lines) + 10 * width + 10
-    key = row * stride + along
+    key = near.row[order] * stride + near.along[order]
     low = np.searchsorted(key, station_row * stride + position - width / 2, side="left")
     high = np.searchsorted(key, station_row * stride + position + width / 2, side="right")
     start = np.concatenate([[0], np.cumsum(high - low)])
@@ -78,9 +73,9 @@ def cut_sections(
 
     geometry = np.array(lines)[station_row]
     here = shapely.get_coordinates(shapely.line_interpolate_point(geometry, position))
-    tangent = _tangents(geometry, position)
+    tangent = tangents(geometry, position)
     origin = np.column_stack([here, sample(dtm, here)])
-    z = cloud.xyz[members[index], 2] - np.repeat(origin[:, 2], high - low)
+    z = cloud.xyz[member[index], 2] - np.repeat(origin[:, 2], high - low)
     return Sections(
         rows["row_id"].to_numpy()[station_row],
         position,
@@ -88,49 +83,13 @@ def cut_sections(
         tangent,
         rows["spacing_m"].to_numpy()[station_row],
         start,
-        np.column_stack([across[index], z]),
-        heights[members[index]],
+        np.column_stack([left[index], z]),
+        heights[member[index]],
     )
 
 
-def _row_coordinates(
-    xyz: Values, lines: list[shapely.LineString], reach: Values
-) -> tuple[NDArray[np.int64], Values, Values, NDArray[np.int64]]:
-    """Row, metres along it and to its left, and index of the points within ``reach`` (rows,) of their nearest row."""
-    guides = [np.linspace(0, line.length, max(2, round(line.length / GUIDE) + 1)) for line in lines]
-    row = np.concatenate([np.full(len(g), k) for k, g in enumerate(guides)])
-    position = np.concatenate(guides)
-    geometry = np.array(lines)[row]
-    guide = shapely.get_coordinates(shapely.line_interpolate_point(geometry, position))
-    tangent = _tangents(geometry, position)
-    # The nearest guide of a cell is near enough to the nearest of its points: both are projected on its tangent.
-    grid = grid_over(xyz, resolution=GUIDE)
-    x, y = grid.centres()
-    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    distance, nearest = cKDTree(guide).query(centres, distance_upper_bound=float(reach.max()) + GUIDE, workers=-1)
-    near = np.isfinite(distance)
-    cells = cell_of(xyz, grid)
-    members = np.flatnonzero(near[cells])
-    g = nearest[cells[members]]
-    offset = xyz[members, :2] - guide[g]
-    ahead = (offset * tangent[g]).sum(axis=1)
-    left = tangent[g, 0] * offset[:, 1] - tangent[g, 1] * offset[:, 0]
-    inside = np.abs(left) <= reach[row[g]]
-    return row[g][inside], (position[g] + ahead)[inside], left[inside], members[inside]
-
-
-def _tangents(lines: NDArray[np.object_], position: Values) -> Values:
-    """Unit tangents (n, 2) of lines at metres along them, over half a metre."""
-    length = shapely.length(lines)
-    a = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(position - 0.25, 0, None)))
-    b = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.minimum(position + 0.25, length)))
-    out: Values = (b - a) / np.hypot(*(b - a).T)[:, None]
-    return out
-
-
-def _stations(line: shapely.LineString, row: int, gaps: gpd.GeoDataFrame, step: float) -> Values:
-    """Positions along a row at equal steps, its ends and the edges of gaps included as far as a step allows."""
-    del row
+def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:
+    """Positions along a row at equal steps from end to end, but for those in gaps."""
     position = np.linspace(0, line.length, max(2, round(line.length / step) + 1))
     for start, end in zip(gaps["start_m"], gaps["end_m"], strict=True):
         position = position[(position <= start) | (position >= end)]

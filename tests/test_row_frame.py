@@ -1,0 +1,69 @@
+"""The frame of a row: coordinates in it, and smoothing along it."""
+
+import numpy as np
+import pytest
+
+from vinemap.row_frame import between, extend, resample, row_coordinates, runs_above, way_along, whittaker
+
+
+def test_coordinates_on_an_arc():
+    t = np.linspace(0, 1.2, 400)
+    arc = np.column_stack([30 * np.sin(t), 30 - 30 * np.cos(t)])
+    xyz = np.random.default_rng(0).uniform([-2, -2, 0], [30, 22, 1], (20000, 3))
+    near = row_coordinates(xyz, [arc], np.array([1.5]))
+    radius = np.hypot(xyz[:, 0], xyz[:, 1] - 30)
+    along = 30 * np.arctan2(xyz[:, 0], 30 - xyz[:, 1])
+    inside = (np.abs(radius - 30) < 1.45) & (along > 0) & (along < 36)
+    assert set(np.flatnonzero(inside)) <= set(near.member)
+    middle = (near.along > 0.5) & (near.along < 35.5)
+    assert near.left[middle] == pytest.approx(30 - radius[near.member][middle], abs=0.01)
+    # Metres along the arc are those of the point's foot on it, to what a chord of 0.25 m differs from it.
+    assert near.along[middle] == pytest.approx(along[near.member][middle], abs=0.03)
+
+
+def test_points_go_to_the_nearest_row():
+    curves = [np.array([[0, 0], [10.0, 0]]), np.array([[0, 2.0], [10.0, 2.0]])]
+    xyz = np.random.default_rng(0).uniform([0, -1, 0], [10, 3, 1], (5000, 3))
+    near = row_coordinates(xyz, curves, np.array([1.25, 1.25]))
+    y = xyz[near.member, 1]
+    assert (y[near.row == 0] < 1.13).all()
+    assert (y[near.row == 1] > 0.87).all()
+
+
+def test_lengths_ends_and_parts():
+    curve = np.array([[0, 0], [3, 4.0], [3, 10]])
+    assert list(way_along(curve)) == [0, 5, 11]
+    assert way_along(extend(curve, 2))[-1] == pytest.approx(15)
+    assert len(resample(curve, 0.5)) == 23
+    assert resample(curve, 0.5)[[0, -1]].tolist() == [[0, 0], [3, 10]]
+    assert between(curve, 5, 8).tolist() == [[3, 4], [3, 7]]
+
+
+def test_runs_above_a_level():
+    profile = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1.0])
+    assert runs_above(profile, 0.5).tolist() == [[1.5, 4.5], [6.5, 8]]
+    assert len(runs_above(profile, 2)) == 0
+
+
+def test_whittaker_keeps_lines_and_fills_gaps():
+    x = np.arange(200) * 0.01
+    weights = np.ones(200)
+    weights[60:120] = 0
+    noisy = np.where(weights > 0, x, 99.0)
+    assert np.allclose(whittaker(noisy, weights, cutoff=50), x, atol=1e-6)
+
+
+def test_whittaker_halves_its_cutoff():
+    t = np.arange(4000)
+    for wavelength, low, high in ((100, 0.45, 0.55), (400, 0.97, 1.0), (25, 0.0, 0.01)):
+        smooth = whittaker(np.sin(2 * np.pi * t / wavelength), np.ones(4000), cutoff=100)
+        assert low <= np.abs(smooth[1000:3000]).max() <= high
+
+
+def test_whittaker_fades_across_gaps_with_a_ridge():
+    weights = np.ones(400)
+    weights[150:250] = 0
+    values = np.where(weights > 0, 1.0, 99.0)
+    smooth = whittaker(values, weights, cutoff=20, ridge=0.02)
+    assert abs(smooth[200]) < 0.2
+    assert smooth[50] == pytest.approx(1, abs=0.03)

@@ -1,0 +1,198 @@
+"""Courses to rows: centre lines, ends and gaps from the points themselves.
+
+Rasters have told where rows run; their cells would leave a centimetre or two in every end. Here the points near each
+row are put into its own frame, where cover is counted in cells that turn and shift with the row, so that neither the
+parcel's place nor its rotation matters.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from scipy.ndimage import gaussian_filter
+
+from vinemap.raster import Raster, cell_of, sample
+from vinemap.row_frame import between, centre_line, extend, normals, resample, row_coordinates, runs_above, way_along
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from vinemap.cloud import PointCloud
+
+    Values = NDArray[np.floating]
+
+CELL = 0.05
+"""Metres of a cell of a straightened row, along and across."""
+MARGIN = 1.5
+"""Metres beyond a course's ends where canopy is still looked for."""
+RAMP = 0.1
+"""Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
+REACH = 0.2
+"""Metres beyond its half width from which a row's points are taken, as it may still move."""
+SHORTEST = 0.35
+"""Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
+VERTEX = 0.5
+"""Metres between the vertices of a curve."""
+
+
+class _Fit(NamedTuple):
+    """Curve (n, 2) between a row's ends, and its runs of canopy (k, 2) in metres along it."""
+
+    curve: Values
+    runs: Values
+
+
+class _Points(NamedTuple):
+    """Coordinates (n, 3), and how far (n,) each is canopy, 0 to 1."""
+
+    xyz: Values
+    canopy: Values
+
+
+class _Share(NamedTuple):
+    """Points of one row: their station (in ``CELL`` along it, n of them), metres to its left, and canopy 0 to 1."""
+
+    station: Values
+    left: Values
+    canopy: Values
+    n: int
+
+
+def fit_rows(
+    courses: gpd.GeoDataFrame,
+    cloud: PointCloud,
+    heights: Values,
+    cover: Raster,
+    dtm: Raster,
+    *,
+    low: float = 0.5,
+    high: float = 2.9,
+    smoothing: float = 3.0,
+    end_share: float = 0.5,
+    min_gap: float = 0.8,
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Fit the rows' curves to the points of their canopies.
+
+    Parameters
+    ----------
+    courses : GeoDataFrame
+        LineString with ``spacing_m``.
+    cloud : PointCloud
+        The parcel's points.
+    heights : (n,) array
+        Their heights above ground in metres.
+    cover : Raster
+        Canopy cover; where it is zero there are trees or houses, whose points don't count.
+    dtm : Raster
+        Terrain, which gives curves their elevation.
+    low, high : float
+        Heights in metres between which points count as canopy.
+    smoothing : float
+        Wavelength in metres below which bends of the centre line are taken for noise.
+    end_share : float
+        Share of the row's median cover at which its canopy begins and ends.
+    min_gap : float
+        Metres without canopy that make a gap.
+
+    Returns
+    -------
+    rows, gaps : GeoDataFrame
+        LineStringZ with ``spacing_m``, ``gap_m`` and ``support`` (share of the length with canopy); LineStringZ with
+        ``row`` (position in rows), ``start_m``, ``end_m``, ``length_m`` along γ.
+    """
+    curves = [resample(extend(shapely.get_coordinates(line), MARGIN), CELL) for line in courses.geometry]
+    half = np.minimum(0.8, 0.42 * courses["spacing_m"].to_numpy())
+    fits: list[_Fit | None] = []
+    if curves:
+        canopy = np.clip((heights - low) / RAMP + 0.5, 0, 1) * np.clip((high - heights) / RAMP + 0.5, 0, 1)
+        canopy *= cover.values.ravel()[cell_of(cloud.xyz, cover.grid)] > 0
+        points = _Points(cloud.xyz, canopy)
+        for passes in (3, 1):
+            points, shares = _deal(points, curves, half)
+            for k, share in enumerate(shares):
+                shift = np.zeros(len(curves[k]))
+                for _ in range(passes):
+                    image, offsets = _straighten(share, shift, half[k])
+                    shift = shift + centre_line(image, offsets, reach=0.75 * half[k], cutoff=smoothing / CELL)
+                curves[k], shares[k] = _shifted(curves[k], shift), share
+                if passes == 1:
+                    fits.append(_ends(curves[k], _straighten(share, shift, half[k])[0], end_share))
+    rows, gaps = [], []
+    for fit, spacing in zip(fits, courses["spacing_m"], strict=True):
+        if fit is None:
+            continue
+        empty = np.column_stack([fit.runs[:-1, 1], fit.runs[1:, 0]])
+        support = 1 - np.diff(empty, axis=1).sum() / fit.runs[-1, 1]
+        empty = empty[np.diff(empty, axis=1)[:, 0] >= min_gap]
+        gaps += [(len(rows), a, b, b - a, _line(between(fit.curve, a, b), dtm)) for a, b in empty]
+        line = _line(resample(fit.curve, VERTEX), dtm)
+        rows.append((spacing, float(np.diff(empty, axis=1).sum()), float(support), line))
+    return (
+        _frame(rows, ["spacing_m", "gap_m", "support"], cover),
+        _frame(gaps, ["row", "start_m", "end_m", "length_m"], cover),
+    )
+
+
+def _deal(points: _Points, curves: Sequence[Values], half: Values) -> tuple[_Points, list[_Share]]:
+    """Points near the curves, and each curve's share of them in its own frame."""
+    near = row_coordinates(points.xyz, curves, half + REACH)
+    order = np.argsort(near.row, kind="stable")
+    first = np.searchsorted(near.row[order], np.arange(len(curves) + 1))
+    shares = []
+    for k, curve in enumerate(curves):
+        mine = order[first[k] : first[k + 1]]
+        station = near.along[mine] / way_along(curve)[-1] * (len(curve) - 1)
+        shares.append(_Share(station, near.left[mine], points.canopy[near.member[mine]], len(curve)))
+    return _Points(points.xyz[near.member], points.canopy[near.member]), shares
+
+
+def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:
+    """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
+    m = int(np.ceil(half / CELL))
+    left = (share.left - np.interp(share.station, np.arange(share.n), shift)) / CELL + m
+    inside = (share.station > -0.5) & (share.station < share.n - 0.5) & (left > -0.5) & (left < 2 * m + 0.5)
+    shape = (share.n, 2 * m + 1)
+    cell = np.rint(share.station[inside]).astype(np.int64) * shape[1] + np.rint(left[inside]).astype(np.int64)
+    everything = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
+    leaves = np.bincount(cell, weights=share.canopy[inside], minlength=shape[0] * shape[1]).reshape(shape)
+    density = max(float(everything.mean()), 1e-9)
+    sigma = max(1.0, density**-0.5)
+    image = gaussian_filter(leaves, sigma) / (gaussian_filter(everything, sigma) + 0.1 * density)
+    return image, np.arange(-m, m + 1) * CELL
+
+
+def _shifted(curve: Values, offset: Values) -> Values:
+    return resample(curve + offset[:, None] * normals(curve, smoothing=1 / CELL), CELL)
+
+
+def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
+    """Cut a curve to where its canopy begins and ends."""
+    profile = image.sum(axis=1) * CELL
+    present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
+    if len(present) == 0:
+        return None
+    step = way_along(curve)[-1] / (len(curve) - 1)
+    edge = end_share * float(np.median(present))
+    # Thin canopies have holes: what a weaker trace joins is one run, from its first to its last full edge.
+    weak = runs_above(profile, 0.5 * edge)
+    full = runs_above(profile, edge)
+    runs = [(f[0, 0], f[-1, 1]) for a, b in weak if len(f := full[(full[:, 0] >= a) & (full[:, 1] <= b)])]
+    runs = [(a, b) for a, b in runs if (b - a) * step >= SHORTEST]
+    if not runs:
+        return None
+    metres = np.array(runs) * step
+    return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0])
+
+
+def _line(curve: Values, dtm: Raster) -> shapely.LineString:
+    return shapely.LineString(np.column_stack([curve, sample(dtm, curve)]))
+
+
+def _frame(records: Sequence[tuple[object, ...]], columns: list[str], cover: Raster) -> gpd.GeoDataFrame:
+    data = {name: [r[k] for r in records] for k, name in enumerate(columns)}
+    return gpd.GeoDataFrame(data, geometry=[r[-1] for r in records], crs=cover.crs)
