@@ -19,7 +19,8 @@ from vinemap.config import SurveyConfig, choose_parcel, load_survey
 from vinemap.crs import parse_crs
 from vinemap.errors import ConfigError, InputError
 from vinemap.parcel import Summary, map_parcel
-from vinemap.synthetic import barolo, write_survey
+from vinemap.scenes import barolo
+from vinemap.synthetic import write_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable

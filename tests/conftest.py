@@ -6,7 +6,8 @@ import pytest
 
 from vinemap.cloud import PointCloud
 from vinemap.crs import parse_crs
-from vinemap.synthetic import Vineyard, hillside, rows_of, simulate
+from vinemap.scenes import hillside, rows_of
+from vinemap.synthetic import Vineyard, simulate
 
 SHARED = Path(__file__).parents[2] / "shared"
 

@@ -7,7 +7,8 @@ from vinemap.cloud import PointCloud
 from vinemap.crs import parse_crs
 from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
 from vinemap.raster import sample
-from vinemap.synthetic import Obstacle, Vineyard, hillside, rows_of, simulate, terraced
+from vinemap.scenes import hillside, rows_of, terraced
+from vinemap.synthetic import Obstacle, Vineyard, simulate
 
 UTM = parse_crs("EPSG:32632")
 

@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
 BASE = {"errors", "crs"}
-DATA = {"cloud", "raster", "vector", "mesh"}
-STAGES = {"ground", "row_field", "key_points", "clustering", "curves", "row_table"}
+DATA = {"cloud", "raster", "vector", "mesh", "row_frame"}
+STAGES = {"ground", "row_field", "key_points", "clustering", "curves", "row_fit", "row_table"}
 STAGES |= {"sections", "canopy", "cgon", "odometry"}
-BESIDE = {"evaluate", "synthetic"}
+BESIDE = {"evaluate", "synthetic", "scenes"}
 SETTINGS = {"config", "paths"}
 CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
 # What each module of vinemap, and any flow, may import of vinemap. Its version is everyone's.
@@ -29,8 +29,10 @@ MAY_IMPORT = {
     **dict.fromkeys(DATA, BASE | DATA | {"style"}),
     **dict.fromkeys(STAGES, BASE | DATA),
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
+    "scenes": BASE | {"synthetic"},
     **dict.fromkeys(SETTINGS, BASE),
     "parcel": CHAIN,
+    "accuracy": CHAIN,
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
     "flows": CHAIN | {"parcel", "cli", "flows"},
@@ -89,6 +91,8 @@ def test_imports_go_one_way(path):
         ("from vinemap.config import Config\nfrom vinemap import paths", "parcel", []),
         ("from vinemap.paths import product", "config", ["paths"]),
         ("from vinemap.raster import Raster", "synthetic", ["raster"]),
+        ("from vinemap.scenes import rows_of", "synthetic", ["scenes"]),
+        ("from vinemap.synthetic import simulate", "scenes", []),
         ("from prefect import task", "parcel", ["prefect"]),
         ("import prefect.futures", "cli", ["prefect"]),
         ("from flows.parcel import map_parcel", "cli", ["flows"]),

@@ -16,7 +16,8 @@ from vinemap.crs import Origin, main_to_wgs84
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate import evaluate_rows
 from vinemap.parcel import STAGES, call, map_parcel
-from vinemap.synthetic import Obstacle, Vineyard, hillside, rows_of, simulate, write_survey
+from vinemap.scenes import hillside, rows_of
+from vinemap.synthetic import Obstacle, Vineyard, simulate, write_survey
 from vinemap.vector import LAYERS
 
 

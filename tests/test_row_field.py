@@ -9,7 +9,8 @@ from vinemap.crs import parse_crs
 from vinemap.ground import height_above_ground, terrain_model
 from vinemap.raster import Grid, Raster, grid_over
 from vinemap.row_field import canopy_cover, estimate_row_field
-from vinemap.synthetic import Obstacle, Vineyard, hillside, rows_of, simulate
+from vinemap.scenes import hillside, rows_of
+from vinemap.synthetic import Obstacle, Vineyard, simulate
 
 UTM = CRS.from_epsg(32632)
 

@@ -11,20 +11,19 @@ import shapely
 from pyproj import CRS
 
 from vinemap.crs import to_main
-from vinemap.synthetic import (
+from vinemap.scenes import (
+    FAMILIES,
     PLACE,
     TABLE_2_1,
     TABLE_2_1_ORIGIN,
-    Obstacle,
-    Vineyard,
     barolo,
+    family,
     hillside,
     rows_of,
-    simulate,
     surface_through,
     terraced,
-    write_survey,
 )
+from vinemap.synthetic import Obstacle, Vineyard, simulate, write_survey
 
 SLOPE = hillside(0.2, uphill=120, seed=4)
 

@@ -122,7 +122,8 @@ def fit_rows(
                 curves[k], shares[k] = _shifted(curves[k], shift), share
                 if passes == 1:
                     fits.append(_ends(curves[k], _straighten(share, shift, half[k])[0], end_share))
-    rows, gaps = [], []
+    rows: list[tuple[object, ...]] = []
+    gaps: list[tuple[object, ...]] = []
     for fit, spacing in zip(fits, courses["spacing_m"], strict=True):
         if fit is None:
             continue

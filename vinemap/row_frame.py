@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import shapely
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
@@ -40,12 +39,12 @@ class RowCoordinates(NamedTuple):
 
 def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> RowCoordinates:
     """Refer the points (n, ≥2) within ``reach`` (rows,) metres of their nearest curve (k, 2) to it."""
-    lines = np.array([shapely.LineString(curve) for curve in curves])
-    guides = [np.linspace(0, line.length, max(2, round(line.length / GUIDE) + 1)) for line in lines]
+    lengths = [float(way_along(curve)[-1]) for curve in curves]
+    guides = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
     row = np.concatenate([np.full(len(g), k) for k, g in enumerate(guides)])
     position = np.concatenate(guides)
-    guide = shapely.get_coordinates(shapely.line_interpolate_point(lines[row], position))
-    tangent = tangents(lines[row], position)
+    guide = np.concatenate([at(curve, g) for curve, g in zip(curves, guides, strict=True)])
+    tangent = np.concatenate([tangents(curve, g) for curve, g in zip(curves, guides, strict=True)])
     # The nearest guide of a cell is near enough to the nearest of its points: both are projected on its tangent.
     grid = grid_over(xyz, resolution=GUIDE)
     centres = np.stack(np.meshgrid(*grid.centres()), axis=-1).reshape(-1, 2)
@@ -60,12 +59,16 @@ def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> Row
     return RowCoordinates(row[g][inside], along[inside], left[inside], member[inside])
 
 
-def tangents(lines: NDArray[np.object_], position: Values) -> Values:
-    """Unit tangents (n, 2) of lines (n,) at metres along them, over half a metre."""
-    length = shapely.length(lines)
-    a = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(position - 0.25, 0, None)))
-    b = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.minimum(position + 0.25, length)))
-    out: Values = (b - a) / np.hypot(*(b - a).T)[:, None]
+def at(curve: Values, position: Values) -> Values:
+    """Points (m, 2) of a curve (n, 2) at metres (m,) along it; before its start and past its end, its ends."""
+    way = way_along(curve)
+    return np.column_stack([np.interp(position, way, curve[:, k]) for k in (0, 1)])
+
+
+def tangents(curve: Values, position: Values) -> Values:
+    """Unit tangents (m, 2) of a curve (n, 2) at metres (m,) along it, over half a metre."""
+    chord = at(curve, position + 0.25) - at(curve, position - 0.25)
+    out: Values = chord / np.hypot(*chord.T)[:, None]
     return out
 
 
@@ -93,16 +96,14 @@ def extend(curve: Values, by: float) -> Values:
 
 def resample(curve: Values, step: float) -> Values:
     """Curve (n, 2) at equal steps of about ``step`` metres along it, ends kept."""
-    way = way_along(curve)
-    at = np.linspace(0, way[-1], max(2, round(float(way[-1]) / step) + 1))
-    return np.column_stack([np.interp(at, way, curve[:, k]) for k in (0, 1)])
+    length = float(way_along(curve)[-1])
+    return at(curve, np.linspace(0, length, max(2, round(length / step) + 1)))
 
 
 def between(curve: Values, start: float, end: float) -> Values:
     """Part of a curve (n, 2) between two metres along it."""
     way = way_along(curve)
-    at = np.concatenate([[start], way[(way > start) & (way < end)], [end]])
-    return np.column_stack([np.interp(at, way, curve[:, k]) for k in (0, 1)])
+    return at(curve, np.concatenate([[start], way[(way > start) & (way < end)], [end]]))
 
 
 def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:

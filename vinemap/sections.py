@@ -9,7 +9,7 @@ import shapely
 
 from vinemap.cloud import Sections
 from vinemap.raster import sample
-from vinemap.row_frame import row_coordinates, tangents
+from vinemap.row_frame import at, row_coordinates, tangents
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -71,9 +71,8 @@ def cut_sections(
     start = np.concatenate([[0], np.cumsum(high - low)])
     index = np.arange(start[-1]) - np.repeat(start[:-1] - low, high - low)
 
-    geometry = np.array(lines)[station_row]
-    here = shapely.get_coordinates(shapely.line_interpolate_point(geometry, position))
-    tangent = tangents(geometry, position)
+    here = np.concatenate([at(curve, p) for curve, p in zip(curves, parts, strict=True)])
+    tangent = np.concatenate([tangents(curve, p) for curve, p in zip(curves, parts, strict=True)])
     origin = np.column_stack([here, sample(dtm, here)])
     z = cloud.xyz[member[index], 2] - np.repeat(origin[:, 2], high - low)
     return Sections(

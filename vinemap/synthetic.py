@@ -20,25 +20,15 @@ import numpy as np
 import pandas as pd
 import shapely
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.linalg import block_diag
-from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
-
-from vinemap.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
 
 Array = NDArray[np.float64]
 Terrain = Callable[[Array, Array], Array]
 """Elevation (m) of the ground at x (east) and y (north)."""
 
-PLACE = (414750.0, 4940780.0)
-"""Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
-TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
 MADE = date(2019, 6, 1)
 """Date that a simulated cloud states, so that the same survey is the same file on any day."""
-TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
-ROW_14_BEND = 0.6
-"""How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
 
 STATION = 0.1  # spacing of canopy stations along a row (m)
 CELL = 0.25  # cells in which rays are dealt out (m)
@@ -68,11 +58,13 @@ class Vineyard:
     """Share of single dead vines."""
     gaps: Sequence[int] = ()
     """Runs of so many dead vines, dealt to rows at random."""
+    outline: shapely.Polygon | None = None
+    """Polygon of the parcel; by default 3 m about the hull of the rows. A parcel without rows needs one."""
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A tree (ellipsoid of leaves) or a hut (solid box); lengths in metres, heights above its ground."""
+    """A tree or bush (ellipsoid of leaves), or a hut, post or wire (solid box); metres, heights above its ground."""
 
     x: float
     y: float
@@ -81,6 +73,8 @@ class Obstacle:
     top: float
     bottom: float = 0.0
     solid: bool = False
+    azimuth: float = 0.0
+    """Direction of its length, degrees anticlockwise from east."""
 
 
 class Survey(NamedTuple):
@@ -94,6 +88,8 @@ class Survey(NamedTuple):
     mean_height, mean_width."""
     dead_vines: gpd.GeoDataFrame
     """PointZ; parcel, row, vine (1 is at e1)."""
+    gaps: gpd.GeoDataFrame
+    """LineStringZ on the ground from foliage to foliage over dead vines; parcel, row, n_vines."""
     parcels: gpd.GeoDataFrame
     """Polygons; name."""
     terrain: Terrain
@@ -115,49 +111,6 @@ class _Stations(NamedTuple):
     leaves: Array  # (n, LAYERS) per metre
 
 
-def rows_of(
-    n: int = 8,
-    *,
-    length: float = 40.0,
-    spacing: float = 2.5,
-    azimuth: float = 0.0,
-    radius: float = math.inf,
-    fan: float = 0.0,
-    centre: tuple[float, float] = PLACE,
-) -> list[Array]:
-    """Rows side by side: parallel, fanned, or on concentric arcs.
-
-    Parameters
-    ----------
-    n, length, spacing : int, float, float
-        Number of rows, length of the middle one and distance between them (m).
-    azimuth : float
-        Direction of the rows, degrees anticlockwise from east. Rows are numbered towards its left.
-    radius : float
-        Of the middle row (m); positive bends to the left. Rows on arcs subtend the same angle.
-    fan : float
-        Angle between the first and the last row (degrees), each turned about its middle.
-    centre : tuple
-        Middle of the block, x and y (m).
-
-    Returns
-    -------
-    list of array (m, 2)
-    """
-    u = np.linspace(-length / 2, length / 2, int(length / 0.25) + 2)
-    rows = []
-    for i in range(n):
-        v = (i - (n - 1) / 2) * spacing
-        if math.isfinite(radius):
-            along, across = (radius - v) * np.sin(u / radius), radius - (radius - v) * np.cos(u / radius)
-        else:
-            turn = math.radians(fan) * (i / max(n - 1, 1) - 0.5)
-            along, across = u * math.cos(turn), v + u * math.sin(turn)
-        cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
-        rows.append(np.column_stack([centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos]))
-    return rows
-
-
 def waves(rng: np.random.Generator, wavelength: float) -> Terrain:
     """Smooth random surface of mean 0 and variance 1, with waves of about ``wavelength`` (m)."""
     n = 8
@@ -169,85 +122,6 @@ def waves(rng: np.random.Generator, wavelength: float) -> Terrain:
         for k in range(n):
             total += np.sin(wave[k] * (x * math.cos(heading[k]) + y * math.sin(heading[k])) + phase[k])
         return total * math.sqrt(2 / n)
-
-    return surface
-
-
-def hillside(
-    slope: float = 0.1,
-    *,
-    uphill: float = 90.0,
-    undulation: float = 0.1,
-    elevation: float = 300.0,
-    centre: tuple[float, float] = PLACE,
-    seed: int = 0,
-) -> Terrain:
-    """Plane of ``slope`` (rise over run) that rises towards ``uphill`` (degrees anticlockwise from east).
-
-    ``undulation`` is the standard deviation (m) of waves of about 25 m on it, ``elevation`` its height at ``centre``.
-    """
-    bumps = waves(np.random.default_rng(seed), 25.0)
-    dx, dy = slope * math.cos(math.radians(uphill)), slope * math.sin(math.radians(uphill))
-    return lambda x, y: elevation + dx * (x - centre[0]) + dy * (y - centre[1]) + undulation * bumps(x, y)
-
-
-def terraced(terrain: Terrain, rows: Sequence[Array], *, spacing: float = 2.5, riser: float = 0.8) -> Terrain:
-    """Cut a slope into treads, level across each row, and risers ``riser`` m wide half way between rows."""
-    points = np.concatenate(rows)
-    tangents = np.concatenate([np.gradient(row, axis=0) for row in rows])
-    normals = np.column_stack([-tangents[:, 1], tangents[:, 0]]) / np.linalg.norm(tangents, axis=1, keepdims=True)
-    tree = cKDTree(points)
-
-    def surface(x: Array, y: Array) -> Array:
-        xy = np.column_stack([np.ravel(x), np.ravel(y)])
-        nearest = tree.query(xy)[1]
-        across = np.sum((xy - points[nearest]) * normals[nearest], axis=1)
-        edge = np.clip((np.abs(across) - (spacing - riser) / 2) / (riser / 2), 0, 1)
-        cut = np.minimum(np.abs(across), spacing / 2) * (1 - edge**2 * (3 - 2 * edge)) * np.sign(across)
-        foot = xy - cut[:, None] * normals[nearest]
-        return terrain(foot[:, 0], foot[:, 1]).reshape(np.shape(x))
-
-    return surface
-
-
-def surface_through(
-    means: Sequence[tuple[Array, float]], base: Terrain, *, cell: float = 1.5, margin: float = 50.0
-) -> Terrain:
-    """Bend ``base`` as little as possible (thin plate) until its mean over each set of points is as given.
-
-    Parameters
-    ----------
-    means : sequence of (array (k, 2), float)
-        Points and the mean elevation over them (m); a single point fixes the surface there.
-    base : callable
-        Surface to start from.
-    cell, margin : float
-        The surface is held on a grid of this cell (m), wider than the points by ``margin`` (m) all round.
-    """
-    points = np.concatenate([xy for xy, _ in means])
-    origin, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
-    averaging = block_diag(*[np.full((1, len(xy)), 1 / len(xy)) for xy, _ in means])
-
-    def kernel(a: Array) -> Array:
-        squared = np.sum((a[:, None] - points[None]) ** 2, axis=-1)
-        return np.asarray(squared * np.log(np.maximum(squared, 1e-12)))
-
-    def plane(a: Array) -> Array:
-        return np.column_stack([np.ones(len(a)), (a - origin) / 100])
-
-    wanted = np.array([z for _, z in means]) - averaging @ base(*points.T)
-    flat = averaging @ plane(points)
-    system = np.block([[averaging @ kernel(points) @ averaging.T, flat], [flat.T, np.zeros((3, 3))]])
-    weights = np.linalg.solve(system, np.concatenate([wanted, np.zeros(3)]))
-    nx, ny = np.ceil((upper - origin) / cell).astype(int) + 1
-    nodes = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2) * cell + origin
-    bend = [kernel(part) @ (averaging.T @ weights[:-3]) for part in np.array_split(nodes, len(nodes) // 1000 + 1)]
-    grid = np.concatenate(bend) + plane(nodes) @ weights[-3:] + base(*nodes.T)
-    spline = spline_filter(grid.reshape(nx, ny), order=3, mode="nearest")
-
-    def surface(x: Array, y: Array) -> Array:
-        at = np.stack([(x - origin[0]) / cell, (y - origin[1]) / cell])
-        return np.asarray(map_coordinates(spline, at, order=3, mode="nearest", prefilter=False))
 
     return surface
 
@@ -273,7 +147,7 @@ def simulate(
     Parameters
     ----------
     vineyards : sequence of Vineyard
-        One a parcel, with rows in ``crs``.
+        One a parcel, with rows in ``crs``; without rows, a meadow.
     terrain : callable
         Elevation of the ground (m).
     density, density_outside, surroundings : float
@@ -293,7 +167,7 @@ def simulate(
     rng = np.random.default_rng(seed)
     dead = [vines for vineyard in vineyards for vines in _dead_vines(vineyard, rng)]
     stations = _grow(vineyards, dead, terrain, rng)
-    rows, dead_vines, parcels = _truth(vineyards, dead, stations, terrain, crs)
+    rows, dead_vines, gaps, parcels = _truth(vineyards, dead, stations, terrain, crs)
     hulls = shapely.union_all(parcels.geometry.to_numpy())
     outline = hulls.convex_hull.buffer(surroundings)
 
@@ -344,65 +218,11 @@ def simulate(
         flyers = np.flatnonzero(rng.random(n) < floaters)
         points[flyers, 2] += rng.choice([-1, 1], len(flyers)) * rng.uniform(0.5, 8.0, len(flyers))
         clouds.append(points[leaf | (rng.random(n) >= hidden[cells])])
-    return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, parcels, terrain)
-
-
-def barolo(*, density: float = 380.0, density_outside: float = 60.0, seed: int = 1, table: Path = TABLE_2_1) -> Survey:
-    """Survey of three parcels in Barolo, EPSG:32632: Table 2.1's parcel F, a contour vineyard, two blocks.
-
-    F's rows end where the thesis's do and keep its mean elevations; the rest of the hillside is made up.
-
-    Parameters
-    ----------
-    density, density_outside : float
-        Rays a square metre inside parcels and outside.
-    table : path
-        Table 2.1 as CSV.
-    """
-    data = np.genfromtxt(table, delimiter=",", names=True)
-    crs = parse_crs("EPSG:32632")
-    main = [np.column_stack([data[f"{axis}{end}"] for axis in "xyz"]) for end in ("1", "n_corrected")]
-    e1, en = (from_wgs84(main_to_wgs84(end, TABLE_2_1_ORIGIN), crs) for end in main)
-    along = np.linspace(0, 1, 61)[:, None]
-    rows = [first + (last - first) * along for first, last in zip(e1[:, :2], en[:, :2], strict=True)]
-    chord = en[13, :2] - e1[13, :2]
-    length = float(np.linalg.norm(chord))
-    nearest = (e1[14, :2] - e1[13, :2]) @ chord / length**2
-    bend = PchipInterpolator([0, nearest, 1], [0, -ROW_14_BEND, 0])(np.linspace(0, 1, 241))[:, None]
-    rows[13] = e1[13, :2] + chord * np.linspace(0, 1, 241)[:, None] + bend * np.array([-chord[1], chord[0]]) / length
-
-    curved = rows_of(10, length=60, radius=50, azimuth=20, centre=(414865, 4940773))
-    blocks = rows_of(8, length=40, spacing=2.4, azimuth=-80, centre=(414764, 4940736))
-    blocks += rows_of(9, length=35, spacing=2.8, azimuth=-35, centre=(414800, 4940733))
-    # {Main} is a tangent plane: what lies 0.4 km from its origin stands 1 cm higher above the ellipsoid.
-    lift = np.mean([e1[:, 2] - main[0][:, 2], en[:, 2] - main[1][:, 2]], axis=0)
-    means = [(end[None, :2], float(end[2])) for end in np.concatenate([e1, en])]
-    means += [(row, float(z)) for row, z in zip(rows, data["elevation_as_printed_m"] + lift, strict=True)]
-    contours = np.concatenate([row[::24] for row in curved[::3]])
-    apex = np.array([414865 - 50 * math.sin(math.radians(20)), 4940773 + 50 * math.cos(math.radians(20))])
-    up = 474 + 0.25 * (50 - np.linalg.norm(contours - apex, axis=1)) + 0.03 * (contours[:, 0] - 414865)
-    means += [(xy[None], float(z)) for xy, z in zip(contours, up, strict=True)]
-    terrain = surface_through(means, hillside(0.15, uphill=100, undulation=0.06, elevation=467, seed=seed))
-    return simulate(
-        [
-            Vineyard("F", rows, gaps=(2, 3, 3, 4, 5)),
-            Vineyard("curved", curved, height=1.85, half_width=0.25, gaps=(2, 3, 4, 5)),
-            Vineyard("blocks", blocks, height=2.0, half_width=0.3, dead=0.04, gaps=(2, 3, 5)),
-        ],
-        terrain,
-        name="barolo",
-        density=density,
-        density_outside=density_outside,
-        obstacles=[
-            Obstacle(414784, 4940725, 2.2, 2.0, 5.2, bottom=1.4),
-            Obstacle(414783, 4940750, 2.0, 1.6, 2.7, solid=True),
-        ],
-        seed=seed,
-    )
+    return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain)
 
 
 def write_survey(survey: Survey, folder: Path | str) -> Path:
-    """Write ``<name>.laz``, ``parcels.gpkg`` and ``truth.gpkg`` (layers rows, dead_vines); return the first.
+    """Write ``<name>.laz``, ``parcels.gpkg`` and ``truth.gpkg`` (layers rows, dead_vines, gaps); return the first.
 
     All three are made aside and then moved into ``folder``, the cloud last, so nothing half-made is ever there.
     """
@@ -421,6 +241,7 @@ def write_survey(survey: Survey, folder: Path | str) -> Path:
         survey.parcels.to_file(Path(aside, "parcels.gpkg"), layer="parcels", VERSION="1.2")
         survey.rows.to_file(Path(aside, "truth.gpkg"), layer="rows", VERSION="1.2")
         survey.dead_vines.to_file(Path(aside, "truth.gpkg"), layer="dead_vines", mode="a")
+        survey.gaps.to_file(Path(aside, "truth.gpkg"), layer="gaps", mode="a")
         cloud.write(str(Path(aside, f"{survey.name}.laz")))
         for made in ("parcels.gpkg", "truth.gpkg", f"{survey.name}.laz"):
             Path(aside, made).replace(folder / made)
@@ -435,6 +256,12 @@ def _reached(row: Array) -> Array:
 def _at(row: Array, distance: Array) -> Array:
     """Points (m, 2) of a polyline at distances from its start."""
     return np.column_stack([np.interp(distance, _reached(row), coordinate) for coordinate in row.T])
+
+
+def _on_ground(row: Array, distance: Array, terrain: Terrain) -> Array:
+    """Points (m, 3) on the ground at distances from a polyline's start."""
+    xy = _at(row, distance)
+    return np.column_stack([xy, terrain(*xy.T)])
 
 
 def _dead_vines(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[np.bool_]]:
@@ -491,28 +318,35 @@ def _grow(
                 np.full(n, k), xy, along, arc, np.full(n, step), ground, top, bottom, half_width, 0.02 * lean, leaves
             )
         )
+    if not parts:
+        none, flat = np.empty(0), np.empty((0, 2))
+        no_leaves = np.empty((0, LAYERS))
+        return _Stations(np.empty(0, np.intp), flat, flat, none, none, none, none, none, none, none, no_leaves)
     return _Stations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _truth(
     vineyards: Sequence[Vineyard], dead: Sequence[NDArray[np.bool_]], stations: _Stations, terrain: Terrain, crs: str
-) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
-    rows, spots = [], []
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    rows, spots, gaps = [], [], []
     plots = [(vineyard.name, i, row) for vineyard in vineyards for i, row in enumerate(vineyard.rows, 1)]
     for k, ((name, i, row), vines) in enumerate(zip(plots, dead, strict=True)):
         length = _reached(row)[-1]
-        xy = _at(row, np.linspace(0, length, math.ceil(length / 0.25) + 1))
-        line = np.column_stack([xy, terrain(*xy.T)])
-        alive = (stations.row == k) & (stations.half_width > 0)
+        line = _on_ground(row, np.linspace(0, length, math.ceil(length / 0.25) + 1), terrain)
+        own = (stations.row == k) & (stations.arc > 0) & (stations.arc < length)
+        alive = own & (stations.half_width > 0)
         height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean()
         rows.append((name, i, _reached(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
         gone = np.flatnonzero(vines)
-        xy = _at(row, (gone + 0.5) * length / len(vines))
-        spots += [
-            (name, i, vine + 1, shapely.Point(*point))
-            for vine, point in zip(gone, np.column_stack([xy, terrain(*xy.T)]), strict=True)
-        ]
-    hulls = [(plot.name, shapely.MultiLineString(list(plot.rows)).convex_hull.buffer(3.0)) for plot in vineyards]
+        middles = (gone + 0.5) * length / len(vines)
+        points = _on_ground(row, middles, terrain)
+        spots += [(name, i, vine + 1, shapely.Point(point)) for vine, point in zip(gone, points, strict=True)]
+        bare = np.flatnonzero(np.diff(np.pad(stations.half_width[own] <= 0, 1).astype(int))).reshape(-1, 2)
+        for start, end in bare * stations.step[own][0]:
+            piece = _on_ground(row, np.linspace(start, end, math.ceil((end - start) / 0.25) + 1), terrain)
+            missing = np.count_nonzero((middles > start) & (middles < end))
+            gaps.append((name, i, missing, shapely.LineString(piece)))
+    outlines = [(v.name, v.outline or shapely.MultiLineString(v.rows).convex_hull.buffer(3.0)) for v in vineyards]
     canopy = ["length_3d", "n_vines", "n_dead", "mean_height", "mean_width"]
 
     def frame(records: list[Any], columns: list[str]) -> gpd.GeoDataFrame:
@@ -522,7 +356,8 @@ def _truth(
     return (
         frame(rows, ["parcel", "row", *canopy]),
         frame(spots, ["parcel", "row", "vine"]),
-        frame(hulls, ["name"]),
+        frame(gaps, ["parcel", "row", "n_vines"]),
+        frame(outlines, ["name"]),
     )
 
 
@@ -545,6 +380,8 @@ def _meet_leaves(
     aim, lean = rays
     met = np.zeros(len(aim))
     near = np.flatnonzero(nearest < len(stations.arc))
+    if len(near) == 0:
+        return met
     aim, lean, nearest = aim[near], lean[near], nearest[near]
     offset = aim[:, :2] + at_height * lean - stations.xy[nearest]
     (ax, ay), (lx, ly) = stations.along[nearest].T, lean.T
@@ -592,8 +429,10 @@ def _meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain
     half_height = (obstacle.top - obstacle.bottom) / 2
     half = np.array([obstacle.half_length, obstacle.half_width, half_height])
     # In units of the half axes: a point of the ray is start + rise * way.
-    start = (aim[near] - [obstacle.x, obstacle.y, ground + obstacle.bottom + half_height]) / half
-    way = np.column_stack([lean[near], np.ones(len(near))]) / half
+    cos, sin = math.cos(math.radians(obstacle.azimuth)), math.sin(math.radians(obstacle.azimuth))
+    own_axes = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    start = (aim[near] - [obstacle.x, obstacle.y, ground + obstacle.bottom + half_height]) @ own_axes / half
+    way = np.column_stack([lean[near], np.ones(len(near))]) @ own_axes / half
     if obstacle.solid:
         way = np.where(np.abs(way) < 1e-9, 1e-9, way)
         faces = np.sort([(-1 - start) / way, (1 - start) / way], axis=0)
