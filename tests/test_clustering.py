@@ -102,3 +102,14 @@ def test_no_key_points():
     found = cluster_rows(key_points([np.array([[0, 0], [5.0, 0]])]).iloc[:0])
     assert len(found) == 0
     assert "cluster" in found.columns
+
+
+def test_rows_end_at_a_track_but_not_at_missing_vines():
+    """Rows on both sides of a track of 5 m; one of them also lacks vines for 6 m where its neighbours stand."""
+    west = [np.array([[0, 2.5 * k], [30, 2.5 * k]]) for k in range(5)]
+    east = [np.array([[35, 2.5 * k + 0.1], [60, 2.5 * k + 0.1]]) for k in range(5)]
+    points = key_points(west + east)
+    x = points.geometry.x
+    points = points[~((points["truth"] == 2) & (x > 10) & (x < 16))].reset_index(drop=True)
+    assert_rows_are_kept_apart(cluster_rows(points), 10)
+    assert cluster_rows(points, track_width=50)["cluster"].nunique() == 5

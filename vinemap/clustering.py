@@ -25,6 +25,8 @@ TANGENT_LENGTH = 5.0
 """Metres of a piece's end that tell its tangent."""
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
+FLANK = 4.0
+"""Metres before and after a gap where neighbouring rows must stand for the gap to be a track."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -36,6 +38,7 @@ def cluster_rows(
     across: float = 0.12,
     min_points: int = 6,
     max_gap: float = 20.0,
+    track_width: float = 3.5,
 ) -> gpd.GeoDataFrame:
     """Label the key points of each row.
 
@@ -50,6 +53,8 @@ def cluster_rows(
         Points that a piece of a row has at the least.
     max_gap : float
         Metres of missing vines that a row may bridge; 0 joins nothing.
+    track_width : float
+        Metres from which a gap that the neighbouring rows share is a track or a headland, where rows end.
 
     Returns
     -------
@@ -67,7 +72,9 @@ def cluster_rows(
         return out.assign(cluster=np.empty(0, dtype=np.int64))
     pieces = np.unique(pieces[kept], return_inverse=True)[1]
     ends = _ends(xy[kept], direction[kept], spacing[kept], pieces, graph[kept][:, kept])
-    return out.assign(cluster=_join(ends, max_gap)[pieces])
+    pairs = _candidates(ends, max_gap)
+    pairs = pairs[~_across_track(ends, pairs, xy[kept], track_width)]
+    return out.assign(cluster=_join(pairs, len(ends.spacing))[pieces])
 
 
 def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values) -> coo_array:
@@ -157,12 +164,11 @@ def _like(axis: Values, way: Values) -> Values:
     return axis if axis @ way >= 0 else -axis
 
 
-def _join(ends: _Ends, max_gap: float) -> Labels:
-    """Row (m,) of each piece: ends are paired, the best fitting pair first, each end once."""
-    m = len(ends.spacing) // 2
-    rows = np.arange(m)
-    taken = np.zeros(2 * m, dtype=bool)
-    for a, b in _candidates(ends, max_gap):
+def _join(pairs: NDArray[np.int64], n_ends: int) -> Labels:
+    """Row (m,) of each piece: ends are paired in the order of ``pairs`` (k, 2), each end once."""
+    rows = np.arange(n_ends // 2)
+    taken = np.zeros(n_ends, dtype=bool)
+    for a, b in pairs:
         one, other = rows[a // 2], rows[b // 2]
         if not (taken[a] or taken[b] or one == other):
             taken[[a, b]] = True
@@ -196,3 +202,36 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
     cost = length[fits] + 10 * lateral[fits]
     out: NDArray[np.int64] = pairs[fits][np.argsort(cost, kind="stable")]
     return out
+
+
+def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
+    """Whether the gap between two ends (k, 2) goes on between the neighbouring rows, which stand on both its sides."""
+    tree = cKDTree(xy)
+    out = np.zeros(len(pairs), dtype=bool)
+    for k, (a, b) in enumerate(pairs):
+        gap = ends.xy[b] - ends.xy[a]
+        length = float(np.hypot(*gap))
+        if length < track_width:
+            continue
+        spacing = float(ends.spacing[[a, b]].mean())
+        middle = (ends.xy[a] + ends.xy[b]) / 2
+        near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 3 * spacing)] - ends.xy[a]
+        x = near @ gap / length
+        y = (gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing
+        shares = []
+        for side in (1, -1):
+            beside = x[(side * y > 0.5) & (side * y < 2.6)]
+            before, inside, after = (
+                _covered(beside, low, high) for low, high in ((-FLANK, 0), (0.5, length - 0.5), (length, length + FLANK))
+            )
+            if before > 0.5 and after > 0.5:
+                shares.append(inside)
+        out[k] = bool(shares) and max(shares) < 0.3
+    return out
+
+
+def _covered(x: Values, low: float, high: float) -> float:
+    """Share of the half metres between two bounds that hold a point."""
+    n = max(1, round((high - low) / 0.5))
+    cell = np.floor((x - low) / (high - low) * n)
+    return len(np.unique(cell[(cell >= 0) & (cell < n)])) / n
