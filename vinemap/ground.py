@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample
 
@@ -27,6 +27,12 @@ COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
 STEP = 0.001
 """Heights are sorted in steps of a millimetre."""
+EVEN = 0.02
+"""Metres that terrain may rise from cell to cell above what a fit was made along."""
+WEEDS = 0.3
+"""Metres between a cell's low height and its median up to which its vegetation is weeds, and not a canopy."""
+FEW = 6.0
+"""Points whose heights tell nothing of weeds."""
 SPIKE = 0.3
 """Metres by which a cell of the canopy height model may stand out."""
 NARROWEST = 3.0
@@ -75,26 +81,37 @@ def terrain_model(
     xyz, crs = cloud.xyz, cloud.crs
     grid = grid_over(xyz, resolution=resolution)
     wide = coarser(grid, resolution=COARSE)
-    base = Raster(_coarse_surface(xyz, wide), wide, crs)
+    x, y = grid.centres()
+    coarse = Raster(_coarse_surface(xyz, wide), wide, crs)
+    surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, crs)
+    cell = cell_of(xyz, grid)
+    for _ in range(2):
+        cells = _order_statistics(xyz[:, 2] - sample(surface, xyz), cell, grid, quantile)
+        fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
+        surface = Raster(surface.values + fitted, grid, crs)
+        # On slopes and terraces that were new to it, soil is thin only once cells lie along them.
+        if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
+            break
+    return surface
 
-    cells = _order_statistics(xyz[:, 2] - sample(base, xyz), cell_of(xyz, grid), grid, quantile)
+
+def _fit_terrain(
+    cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float
+) -> Values:
+    """Terrain (ny, nx) that cells tell, in their own heights."""
     noise = _noise(cells, quantile)
-    level = cells.low - noise * _depth(cells.n, quantile)
+    level = cells.low - noise * _depth(cells.n, quantile) * _soil_share(cells, noise, quantile)
     spread = cells.high - cells.low
     weight = np.where(cells.n > 0, np.minimum(cells.n, 15.0) / (1 + (spread / (8 * noise)) ** 2), 0.0)
     thin = binary_opening((cells.n > 3) & (spread < 8 * noise), np.ones((3, 3)))
-
-    surface = np.zeros(grid.shape)
+    surface = np.zeros(level.shape)
     for reach, slack in ((1.5, 4.0), (1.5, 2.5), (1.0, 1.5), (0.6, 1.0), (0.6, 1.0)):
         above = level - surface
         terrain = above < slack * tolerance
         terrain |= thin & (above < terrace_height)
         terrain &= above > -3 * slack * tolerance
         surface = _multiscale(level, weight * terrain, reach / resolution)
-    surface = _multiscale(level, weight * terrain, 0.3 / resolution)
-    x, y = grid.centres()
-    values = surface + sample(base, np.stack(np.meshgrid(x, y), axis=-1))
-    return Raster(values, grid, crs)
+    return _multiscale(level, weight * terrain, 0.3 / resolution)
 
 
 def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
@@ -155,11 +172,38 @@ def _depth(n: Values, quantile: float) -> Values:
     return out
 
 
+def _soil_share(cells: _Cells, noise: float, quantile: float) -> Values:
+    """How much of the noise's depth lies between a cell's low quantile and its soil: 1 on bare soil, below 0 in weeds.
+
+    Heights in weeds are taken as even from the soil up, blurred by the noise: the taller the weeds, the wider the
+    quantiles lie apart, and the higher the low one stands above the soil instead of below it.
+    """
+    x = np.linspace(-4, 45, 2000)
+    table = []
+    for tall in np.linspace(0.01, 40, 80):
+        share = (_ramp(x) - _ramp(x - tall)) / tall
+        low, middle = np.interp([quantile, 0.5], share, x)
+        table.append((middle - low, -low))
+    apart, depth = np.array(table).T
+    bare = -float(ndtri(quantile))
+    spread = cells.middle - cells.low
+    # Few points tell little: they are taken for soil's until more of them say otherwise.
+    share = np.interp(spread / noise, apart, depth) / bare
+    share = (cells.n * share + FEW) / (cells.n + FEW)
+    return np.where(spread < WEEDS, share, 1.0)
+
+
+def _ramp(x: Values) -> Values:
+    """Integral of the standard normal distribution function."""
+    out: Values = x * ndtr(x) + np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    return out
+
+
 def _noise(cells: _Cells, quantile: float) -> float:
     """Standard deviation in metres of the heights of bare soil: that of the cells with the thinnest layers."""
     dense = cells.n >= max(5.0, float(np.quantile(cells.n[cells.n > 0], 0.5)))
     half = (cells.middle - cells.low)[dense] / -_depth(cells.n[dense], quantile)
-    return float(np.clip(np.quantile(half, 0.25), 0.005, 0.1)) if half.size else 0.03
+    return float(np.clip(np.quantile(half, 0.33), 0.005, 0.1)) if half.size else 0.03
 
 
 def _multiscale(level: Values, weight: Values, sigma: float) -> Values:
