@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel test check clean
+.PHONY: help parcel test check accuracy clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -34,6 +34,9 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check
 	@$(BIN)/python -m ruff format --check
 	@$(BIN)/python -m mypy
+
+accuracy: $(READY) ## Measure rows on simulated vineyards: make accuracy [FAMILY="curved fan"]
+	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy
 
 clean: ## Remove .venv and the tools' caches; surveys and products stay
 	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -2,11 +2,15 @@
 
 import logging
 import os
+import tempfile
+from pathlib import Path
 
 # Prefect reads these when it is first imported. Its log goes to its own server; the terminal shows ours.
 os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_LOGGING_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
+if "PREFECT_HOME" not in os.environ and not os.access(Path.home(), os.W_OK):
+    os.environ["PREFECT_HOME"] = str(Path(tempfile.gettempdir()) / f"prefect-{os.getuid()}")
 # Prefect gives every library's log to the terminal; what laspy has to say is in our own error.
 logging.getLogger("laspy").setLevel(logging.CRITICAL)

@@ -39,6 +39,32 @@ def test_reads_las_and_laz(tmp_path, points, suffix):
     assert np.allclose(cloud.xyz, points, atol=0.0006)
 
 
+def test_reads_copc(tmp_path, points):
+    copclib = pytest.importorskip("copclib")
+    offset = copclib.Vector3(*np.floor(points.min(axis=0)))
+    config = copclib.CopcConfigWriter(7, copclib.Vector3(0.001, 0.001, 0.001), offset, UTM.to_wkt())
+    config.las_header.min, config.las_header.max = (
+        copclib.Vector3(*corner) for corner in (points.min(axis=0), points.max(axis=0))
+    )
+    config.copc_info.spacing = 10
+    path = tmp_path / "a.copc.laz"
+    writer = copclib.FileWriter(str(path), config)
+    # A root node and one of its children, which a plain reader of LAZ must find as well.
+    for key, part in (((0, 0, 0, 0), points[:1000]), ((1, 0, 0, 0), points[1000:3000])):
+        node = copclib.Points(writer.copc_config.las_header)
+        for x, y, z in part:
+            point = node.CreatePoint()
+            point.x, point.y, point.z = x, y, z
+            node.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(*key), node)
+    writer.Close()
+    cloud = read_cloud(path)
+    assert cloud.crs == UTM
+    assert len(cloud.xyz) == 3000
+    order = [xyz[np.lexsort(xyz.T)] for xyz in (cloud.xyz.round(3), points[:3000].round(3))]
+    assert np.allclose(*order, atol=0.0011)
+
+
 def test_clips_to_a_polygon_in_another_crs(tmp_path, points):
     square = shapely.box(414710, 4940710, 414730, 4940740)
     to_degrees = Transformer.from_crs(32632, 4326, always_xy=True).transform

@@ -29,6 +29,29 @@ def test_slopes(slope, median, most):
     assert np.quantile(error, 0.95) < most
 
 
+def slope_or_hill(kind):
+    """Rows on bare ground of 100 x 60 m up to the very edges, and that ground."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, [[100], [60]], (2, 900_000))
+
+    def ground(x, y):
+        return 0.01 * (x - 30) ** 2 - 0.004 * (y - 10) ** 2 if kind == "hill" else kind * x
+
+    z = ground(x, y) + rng.normal(0, 0.02, len(x))
+    canopy = (np.abs(y - np.round(y / 2.5) * 2.5) < 0.28) & (np.abs(x - 50) < 46) & (rng.random(len(x)) < 0.85)
+    z[canopy] += rng.uniform(0.6, 1.95, canopy.sum())
+    return np.column_stack([x, y, z]), ground
+
+
+@pytest.mark.parametrize("kind", [0.0, 0.3, 0.45, "hill"])
+def test_slopes_and_hills_hold_up_to_their_edges(kind):
+    xyz, ground = slope_or_hill(kind)
+    dtm = terrain_model(PointCloud(xyz, UTM))
+    error = np.abs(dtm.values - ground(*np.meshgrid(*dtm.grid.centres())))[1:-1, 1:-1]
+    assert np.quantile(error, 0.95) < 0.03
+    assert error.max() < 0.25
+
+
 def test_terraces():
     rows = rows_of(8, length=25, spacing=1.8)
     terrain = terraced(hillside(0.4), rows, spacing=1.8, riser=0.6)

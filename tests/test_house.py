@@ -15,7 +15,18 @@ MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
 BASE = {"errors", "crs"}
 DATA = {"cloud", "raster", "vector", "mesh", "row_frame"}
-STAGES = {"ground", "row_field", "key_points", "clustering", "curves", "row_fit", "row_table"}
+STAGES = {
+    "ground",
+    "row_field",
+    "key_points",
+    "clustering",
+    "curves",
+    "row_fit",
+    "row_table",
+    "blocks",
+    "confidence",
+    "missing",
+}
 STAGES |= {"sections", "canopy", "cgon", "odometry"}
 BESIDE = {"evaluate", "synthetic", "scenes"}
 SETTINGS = {"config", "paths"}

@@ -9,6 +9,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
+from vinemap.blocks import group_blocks
 from vinemap.crs import Origin, from_wgs84
 from vinemap.row_table import describe_rows, number_rows
 
@@ -19,7 +20,7 @@ TABLE = pd.read_csv(Path(__file__).parents[1] / "data" / "table_2_1.csv")
 
 def frame(lines, spacing=2.5):
     geometry = [shapely.LineString(np.column_stack([c, np.zeros(len(c))])) for c in lines]
-    return gpd.GeoDataFrame({"spacing_m": [spacing] * len(lines)}, geometry=geometry, crs=UTM)
+    return group_blocks(gpd.GeoDataFrame({"spacing_m": [spacing] * len(lines)}, geometry=geometry, crs=UTM))
 
 
 def no_gaps():
@@ -81,7 +82,7 @@ def test_table_2_1_comes_back():
     scrambled = gpd.GeoDataFrame(
         {"spacing_m": [2.6] * 16}, geometry=[shapely.reverse(lines[k]) for k in order], crs=UTM
     )
-    rows, ends, points = describe_rows(number_rows(scrambled, no_gaps())[0], parcel="F", origin=ORIGIN)
+    rows, ends, points = describe_rows(number_rows(group_blocks(scrambled), no_gaps())[0], parcel="F", origin=ORIGIN)
     assert list(rows["label"]) == [f"{k} F" for k in range(1, 17)]
     assert np.abs(rows[["e1_x", "e1_y"]].to_numpy() - TABLE[["x1", "y1"]].to_numpy()).max() < 0.005
     assert np.abs(rows[["en_x", "en_y"]].to_numpy() - TABLE[["xn_corrected", "yn_corrected"]].to_numpy()).max() < 0.005
@@ -120,6 +121,6 @@ def test_length_is_three_dimensional_and_elevation_a_mean_along_the_row():
 
 def test_no_rows():
     empty = gpd.GeoDataFrame({"spacing_m": np.empty(0)}, geometry=[], crs=UTM)
-    rows, gaps = number_rows(empty, no_gaps())
+    rows, gaps = number_rows(group_blocks(empty), no_gaps())
     rows, ends, points = describe_rows(rows, parcel="A", origin=ORIGIN)
     assert len(rows) == len(gaps) == len(ends) == len(points) == 0

@@ -103,7 +103,7 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     rows = summarise_rows(truth, table, step=0.25)
     assert np.abs(rows["height_m"] - truth["mean_height"]).max() < 0.08
     assert np.abs(rows["width_m"] - truth["mean_width"]).max() < 0.12
-    assert rows["volume_m3"].sum() == pytest.approx(0.5 * 0.25 * m)
+    assert rows["volume_m3"].sum() == pytest.approx(0.5 * 0.25 * m, rel=0.03)
 
 
 def one_section(points, heights=None):

@@ -12,7 +12,6 @@ from pyproj import CRS
 
 from vinemap.crs import to_main
 from vinemap.scenes import (
-    FAMILIES,
     PLACE,
     TABLE_2_1,
     TABLE_2_1_ORIGIN,
@@ -296,3 +295,60 @@ def test_a_broken_write_leaves_nothing_half_made(survey, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_survey(survey, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_gaps_are_what_dead_vines_leave_of_foliage(survey):
+    assert survey.gaps.n_vines.sum() == len(survey.dead_vines)
+    for gap in survey.gaps.itertuples():
+        row = survey.rows[survey.rows.row == gap.row].iloc[0]
+        vines = gap.n_vines * row.geometry.length / row.n_vines
+        assert gap.geometry.length == pytest.approx(vines - 0.07, abs=0.3)
+        own = survey.dead_vines[survey.dead_vines.row == gap.row]
+        assert (own.distance(gap.geometry) < 0.01).sum() == gap.n_vines
+        near = shapely.contains_xy(gap.geometry.buffer(0.3, cap_style="flat"), *survey.xyz[:, :2].T)
+        height = survey.xyz[near, 2] - survey.terrain(*survey.xyz[near, :2].T)
+        assert np.mean((height > 0.7) & (height < 2.3)) < 0.1
+
+
+def test_a_meadow_has_no_rows(tmp_path):
+    outline = shapely.box(*np.subtract(PLACE, 10), *np.add(PLACE, 10))
+    hedge = Obstacle(*PLACE, 5.0, 0.5, 2.0, azimuth=60)
+    survey = simulate([Vineyard("meadow", (), outline=outline)], SLOPE, density=100, obstacles=[hedge], seed=1)
+    assert (len(survey.rows), len(survey.gaps), len(survey.dead_vines)) == (0, 0, 0)
+    assert survey.parcels.geometry.iloc[0].equals(outline)
+    height = survey.xyz[:, 2] - survey.terrain(*survey.xyz[:, :2].T)
+    x, y = (survey.xyz[(height > 0.6) & (height < 2.5), :2] - PLACE).T
+    assert len(x) > 200
+    assert np.degrees(np.arctan2(*np.linalg.svd(np.cov(x, y))[0][::-1, 0])) % 180 == pytest.approx(60, abs=6)
+    write_survey(survey, tmp_path)
+    assert len(gpd.read_file(tmp_path / "truth.gpkg", layer="rows")) == 0
+
+
+@pytest.mark.parametrize("name", ["short", "single"])
+def test_families_vary_with_the_seed(name):
+    one, same, other = family(name, 0), family(name, 0), family(name, 1)
+    assert one.name == name
+    assert np.array_equal(one.xyz, same.xyz)
+    assert len(one.xyz) != len(other.xyz)
+
+
+def test_headland_divides_rows_that_are_in_line():
+    survey = family("headland", 0)
+    one, other = (survey.rows[survey.rows.parcel == parcel].geometry for parcel in "AB")
+    across = [line.distance(other).min() for line in one]
+    assert min(across) >= 6
+    assert max(across) < 7
+    for line in one:
+        ahead = shapely.LineString(np.array(line.coords)[[0, -1], :2])
+        start, end = np.array(ahead.coords)
+        longer = shapely.LineString([start - 2 * (end - start), end + 2 * (end - start)])
+        assert longer.distance(other).min() < 0.05
+
+
+def test_a_close_row_starts_by_its_neighbour():
+    survey = family("close", 0)
+    lines = survey.rows.geometry.to_numpy()
+    start = shapely.Point(lines[4].coords[0])
+    assert shapely.distance(lines[3], start) == pytest.approx(1.5, abs=0.1)
+    assert lines[4].length < 0.85 * lines[3].length
+    assert shapely.distance(lines[3], lines[2]) > 1.7

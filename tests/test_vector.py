@@ -16,13 +16,16 @@ from vinemap.vector import LAYERS, conform, read_boundary, write_geopackage
 CONTRACT = {
     "rows": (
         "row_id label length_m orientation_deg elevation_m elevation_diff_m n_key_points e1_x e1_y e1_z en_x en_y en_z "
-        "e1_lat e1_lon e1_alt en_lat en_lon en_alt spacing_m height_m width_m volume_m3 gap_m"
+        "e1_lat e1_lon e1_alt en_lat en_lon en_alt spacing_m height_m width_m volume_m3 gap_m "
+        "n_missing block support confidence flags"
     ).split(),
     "row_ends": "row_id label end".split(),
     "key_points": "row_id label order position_m".split(),
     "sections": "row_id label position_m height_m bottom_m width_m area_m2 n_points".split(),
-    "gaps": "row_id label start_m end_m length_m".split(),
-    "parcel": "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m vertical_datum".split(),
+    "gaps": "row_id label start_m end_m length_m n_missing".split(),
+    "parcel": (
+        "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m n_missing vine_spacing_m vertical_datum"
+    ).split(),
 }
 GEOMETRY = {
     "rows": "LineString Z",
@@ -112,9 +115,11 @@ def test_boundaries_of_any_format(tmp_path, suffix):
 def test_boundary_of_the_named_parcel_or_of_all(tmp_path):
     path = tmp_path / "b.gpkg"
     squares = [shapely.box(k, 0, k + 0.9, 1) for k in range(3)]
-    gpd.GeoDataFrame({"no": [1, 2, 3], "Vigna": ["A", "B", "C"]}, geometry=squares, crs=32632).to_file(path)
-    assert read_boundary(path, parcel="B")[0].equals(squares[1])
-    assert read_boundary(path, parcel="other")[0].area == pytest.approx(2.7)
+    gpd.GeoDataFrame({"no": [1, 2, 3], "Vigna": ["A", "Ba", "C"]}, geometry=squares, crs=32632).to_file(path)
+    assert read_boundary(path, parcel="Ba")[0].equals(squares[1])
+    assert read_boundary(path)[0].area == pytest.approx(2.7)
+    with pytest.raises(InputError, match="did you mean 'Ba'"):
+        read_boundary(path, parcel="Baa")
 
 
 def test_boundaries_that_are_none(tmp_path):

@@ -12,7 +12,6 @@ from scipy.ndimage import correlate1d
 from vinemap.mesh import Mesh, loft, merge
 
 if TYPE_CHECKING:
-    import pandas as pd
     from numpy.typing import NDArray
     from pyproj import CRS
 
@@ -202,19 +201,31 @@ def measure_sections(canopy: Sections, polygons: Values, area: Values, *, crs: C
 
 
 def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
-    """Give rows their canopy's mean ``height_m`` and ``width_m``, and its ``volume_m3``; NaN where there is none."""
+    """Give rows their canopy's mean ``height_m`` and ``width_m``, and its ``volume_m3``; NaN where there is none.
+
+    The volume lies between consecutive sections, as the mesh's does: the mean of their areas times their distance.
+    """
     groups = sections.groupby("row_id")
     means = groups[["height_m", "width_m"]].mean().reindex(rows["row_id"])
-    volume: pd.Series = (groups["area_m2"].sum() * step).reindex(rows["row_id"])
+    position, area = sections["position_m"].to_numpy(), sections["area_m2"].to_numpy()
+    joined = ~_breaks(sections["row_id"].to_numpy(), position, step)
+    pieces = (area[1:] + area[:-1]) / 2 * np.diff(position) * joined
+    volume = sections.iloc[1:].assign(piece=pieces).groupby("row_id")["piece"].sum().reindex(rows["row_id"])
     return rows.assign(
         height_m=means["height_m"].to_numpy(), width_m=means["width_m"].to_numpy(), volume_m3=volume.to_numpy()
     )
 
 
+def _breaks(row_id: NDArray[np.int64], position: Values, step: float) -> Flags:
+    """Whether the canopy ends (m - 1,) between consecutive sections (m,): another row, or more than one lacks."""
+    out: Flags = (np.diff(row_id) != 0) | (np.diff(position) > 2.5 * step)
+    return out
+
+
 def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *, step: float) -> list[Mesh]:
     """Closed meshes of the rows' canopies: polygons of consecutive sections, joined (Eq. 20–22).
 
-    A mesh closes and starts anew where sections are more than one and a half ``step`` apart.
+    A mesh closes and starts anew where more than one section lacks.
 
     Parameters
     ----------
@@ -229,7 +240,7 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     """
     normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
     corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
-    breaks = (np.diff(canopy.row_id) != 0) | (np.diff(canopy.position) > 1.5 * step)
+    breaks = _breaks(canopy.row_id, canopy.position, step)
     runs = np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1)
     meshes = []
     numbers = rows.drop(columns="geometry").set_index("row_id", drop=False)

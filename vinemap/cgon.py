@@ -1,6 +1,6 @@
 """Sections of canopy: convex hull, outlier peeling (Algorithm 1) and the minimum-area c-gon (Problem 1).
 
-A section's points are (y, z), y lateral, positive to the right, z height, in metres; polygons run counter-clockwise.
+A section's points are (y, z) in metres, z up and y drawn to the right; polygons run counter-clockwise.
 Compiled code (cached on disk, without the GIL) takes them as complex numbers y + iz. It stays in one file, because
 numba's cache doesn't notice changes in others.
 """
@@ -34,7 +34,10 @@ LONGEST = 256
 
 
 def _compiled(function: F) -> F:
-    return cast("F", njit(cache=True, nogil=True)(function))
+    try:
+        return cast("F", njit(cache=True, nogil=True)(function))
+    except RuntimeError:  # no folder for the cache can be written: compile anew each time
+        return cast("F", njit(nogil=True)(function))
 
 
 class Enclosures(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ class _Origin(click.ParamType):  # type: ignore[type-arg]
     name = "LAT,LON,ALT"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        from vinemap.crs import Origin  # noqa: PLC0415
+        from vinemap.crs import Origin, check_origin  # noqa: PLC0415
 
         try:
             lat, lon, alt = (float(part) for part in str(value).split(","))
@@ -31,9 +32,7 @@ class _Origin(click.ParamType):  # type: ignore[type-arg]
             self.fail(
                 f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx
             )
-        if not (-90 <= lat <= 90 and -180 <= lon <= 180):
-            self.fail(f"{value!r} lies on no globe: latitude comes first, in degrees", param, ctx)
-        return Origin(lat, lon, alt)
+        return check_origin(Origin(lat, lon, alt))
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -64,13 +63,14 @@ def run(
     from vinemap.config import check_name, load_settings  # noqa: PLC0415
     from vinemap.crs import parse_crs  # noqa: PLC0415
 
-    name = check_name(parcel if parcel is not None else paths.stem(cloud))
+    name = check_name(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
     options = {
         "crs": parse_crs(crs) if crs else None,
         "settings": load_settings(settings) if settings else None,
         "boundary": boundary,
         "origin": origin,
+        "named": parcel is not None,
     }
     with progress(name) as step:
         from vinemap.parcel import map_parcel  # noqa: PLC0415
@@ -121,8 +121,11 @@ def main() -> None:
 def plain_errors() -> Iterator[None]:
     """Say errors in one line on stderr: exit code 2 for what the user can mend, 1 for a fault of vinemap's own.
 
-    ``VINEMAP_TRACEBACK=1`` lets a fault through with its traceback.
+    ``VINEMAP_TRACEBACK=1`` lets a fault through with its traceback. A termination signal unwinds like Ctrl-C, so that
+    drafts are removed and servers stopped.
     """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _stop)
     try:
         yield
     except VinemapError as error:
@@ -137,6 +140,11 @@ def plain_errors() -> Iterator[None]:
         if os.environ.get("VINEMAP_TRACEBACK"):
             raise
         _fail(f"a fault of vinemap's own ({type(error).__name__}: {error}); VINEMAP_TRACEBACK=1 shows where", 1)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    del frame
+    raise SystemExit(128 + number)
 
 
 def _fail(reason: object, code: int) -> NoReturn:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.crs import horizontal, metric_crs, transformer, vertical_name, vertical_unit
+from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.floating]
 
 CHUNK = 1_000_000
+LARGEST_RELIEF = 2_000.0
+"""Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
 
@@ -141,7 +143,7 @@ def _stated_crs(header: Any, path: Path) -> CRS:  # noqa: ANN401
         degrees = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
         hint = "--crs EPSG:4326, as they look like degrees" if degrees else "--crs EPSG:n"
         raise InputError(f"{path}: states no CRS for its coordinates: give it with {hint}")
-    return stated
+    return check_horizontal(stated)
 
 
 def _check_header(header: Any, crs: CRS, path: Path) -> None:  # noqa: ANN401
@@ -209,9 +211,7 @@ def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np
 def _clipper(boundary: Boundary, target: CRS, path: Path) -> Callable[[NDArray[np.float64]], NDArray[np.bool_]]:
     import shapely  # noqa: PLC0415
 
-    polygon, crs = boundary
-    convert = transformer(horizontal(crs), target).transform
-    polygon = shapely.force_2d(shapely.transform(polygon, lambda xy: np.column_stack(convert(*xy.T))))
+    polygon = project(*boundary, target)
     bounds = shapely.bounds(polygon)
     if not np.isfinite(bounds).all():
         raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
@@ -231,6 +231,8 @@ def _without_strays(xyz: NDArray[np.float64], path: Path) -> NDArray[np.float64]
     """Drop the few points that lie absurdly far from the rest, which would stretch every raster."""
     low, high = np.quantile(xyz[:: max(1, len(xyz) // 100_000)], [0.002, 0.998], axis=0)
     span = high - low
+    if span[2] > LARGEST_RELIEF:
+        raise InputError(f"{path}: heights span {span[2]:.0f} m, which is no survey: check scale, offset and units")
     if span[:2].max() > LARGEST_SPAN:
         raise InputError(
             f"{path}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check scale, offset and CRS"

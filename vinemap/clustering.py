@@ -222,7 +222,8 @@ def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width
         for side in (1, -1):
             beside = x[(side * y > 0.5) & (side * y < 2.6)]
             before, inside, after = (
-                _covered(beside, low, high) for low, high in ((-FLANK, 0), (0.5, length - 0.5), (length, length + FLANK))
+                _covered(beside, low, high)
+                for low, high in ((-FLANK, 0), (0.5, length - 0.5), (length, length + FLANK))
             )
             if before > 0.5 and after > 0.5:
                 shares.append(inside)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vinemap.crs import Origin  # noqa: TC001  (pydantic reads the annotation)
+from vinemap.crs import Origin, check_origin
 from vinemap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ Metres = Annotated[float, Field(gt=0, le=100)]
 M = TypeVar("M", bound="Options")
 Share = Annotated[float, Field(ge=0, le=1)]
 
-NAME = re.compile(r"[^\W_][\w .-]{0,63}")
-"""Names of surveys and parcels: they become names of files and folders."""
+FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]')
+"""Characters that a name of a file can't have on one system or another."""
 
 
 class Options(BaseModel):
@@ -66,6 +67,8 @@ class RowFieldOptions(Options):
     def _ordered(self) -> RowFieldOptions:
         if self.min_spacing >= self.max_spacing:
             raise ValueError(f"min_spacing ({self.min_spacing}) must be below max_spacing ({self.max_spacing})")
+        if self.window < 3 * self.max_spacing:
+            raise ValueError(f"window ({self.window}) must hold three times max_spacing ({self.max_spacing})")
         return self
 
 
@@ -109,6 +112,12 @@ class FitOptions(Options):
     min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
 
 
+class MissingOptions(Options):
+    """Missing vines."""
+
+    vine_spacing: float | None = Field(None, ge=0.3, le=5, description="distance of vines (m); none: estimated")
+
+
 class SectionOptions(Options):
     """Sections across the rows."""
 
@@ -127,12 +136,18 @@ class CanopyOptions(Options):
     min_share: Share = Field(0.15, description="share of the median section's points that a section has")
     min_height: float = Field(0.8, ge=0, le=5, description="90% height of a section (m)")
 
+    @model_validator(mode="after")
+    def _ordered(self) -> CanopyOptions:
+        if max(self.margin, self.min_height) >= self.max_height:
+            raise ValueError(f"max_height ({self.max_height}) must be above margin and min_height")
+        return self
+
 
 class PolygonOptions(Options):
     """Minimum-area polygons."""
 
     c: int = Field(7, ge=5, le=30, description="vertices of a section's polygon")
-    share: Share = Field(0.02, description="share of a section's points that is peeled off")
+    share: float = Field(0.02, ge=0, le=0.5, description="share of a section's points that is peeled off")
 
 
 class Settings(Options):
@@ -145,6 +160,7 @@ class Settings(Options):
     clustering: ClusteringOptions = ClusteringOptions()
     curves: CurveOptions = CurveOptions()
     fit: FitOptions = FitOptions()
+    missing: MissingOptions = MissingOptions()
     sections: SectionOptions = SectionOptions()
     canopy: CanopyOptions = CanopyOptions()
     polygon: PolygonOptions = PolygonOptions()
@@ -166,6 +182,10 @@ class SurveyConfig(Options):
     def _names(self) -> SurveyConfig:
         for name in (self.survey, *self.parcels):
             check_name(name)
+        if self.origin is not None:
+            check_origin(self.origin)
+        if self.simulate not in (None, self.survey):
+            raise ValueError(f"simulate ({self.simulate}) must be the survey's own name ({self.survey})")
         return self
 
 
@@ -177,10 +197,9 @@ def check_name(name: str) -> str:
     ConfigError
         If it is empty, too long, or has characters of paths.
     """
-    if not NAME.fullmatch(name) or name.endswith((".", " ")):
-        raise ConfigError(
-            f"name {name!r} can't name a file: use letters, digits, spaces, '-', '_' and '.', a letter or digit first"
-        )
+    name = unicodedata.normalize("NFC", name)
+    if not 0 < len(name) <= 64 or FORBIDDEN.search(name) or name[0] in ".- " or name[-1] in ". ":
+        raise ConfigError(f"name {name!r} can't name a file: use letters, digits, spaces, '-' and '_', a letter first")
     return name
 
 
@@ -210,8 +229,17 @@ def load_survey(path: Path) -> SurveyConfig:
 
 
 def load_settings(path: Path) -> Settings:
-    """Read a YAML file with settings of stages; ConfigError names the key, its value and what it may be."""
-    return _validated(Settings, _read_yaml(path), path)
+    """Read a YAML file with settings of stages, under ``settings`` as in a survey's or without.
+
+    Raises
+    ------
+    ConfigError
+        That names the key, its value and what it may be.
+    """
+    data = _read_yaml(path)
+    return _validated(
+        Settings, data["settings"] if isinstance(data, dict) and set(data) == {"settings"} else data, path
+    )
 
 
 def _read_yaml(path: Path) -> Any:  # noqa: ANN401

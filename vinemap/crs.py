@@ -10,16 +10,17 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 from pyproj import CRS, Proj, Transformer
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
-from vinemap.errors import InputError
+from vinemap.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 WGS84 = CRS.from_epsg(4326)
-SCALE_TOLERANCE = 0.01
+SCALE_TOLERANCE = 0.002
 """A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
 
 
@@ -31,6 +32,22 @@ class Origin(NamedTuple):
     alt: float
 
 
+def check_origin(origin: Origin) -> Origin:
+    """Return an origin that lies on the globe.
+
+    Raises
+    ------
+    ConfigError
+        If it doesn't.
+    """
+    if not (abs(origin.lat) <= 90 and abs(origin.lon) <= 180 and abs(origin.alt) < 10_000):
+        raise ConfigError(
+            f"origin {origin.lat:g}, {origin.lon:g}, {origin.alt:g} lies nowhere: give latitude and longitude in "
+            "degrees and altitude in metres"
+        )
+    return origin
+
+
 def parse_crs(text: str) -> CRS:
     """Read a CRS as a user writes it (``EPSG:32632``, ``32632``, WKT, PROJ).
 
@@ -40,9 +57,23 @@ def parse_crs(text: str) -> CRS:
         If PROJ doesn't know it.
     """
     try:
-        return CRS.from_user_input(int(text) if text.strip().isdigit() else text)
+        crs = CRS.from_user_input(int(text) if text.strip().isdigit() else text)
     except CRSError as error:
         raise InputError(f"unknown CRS {text!r}: give it as EPSG:n, for example EPSG:32632") from error
+    return check_horizontal(crs)
+
+
+def check_horizontal(crs: CRS) -> CRS:
+    """Return a CRS that places points on the map: projected or geographic, with heights or not.
+
+    Raises
+    ------
+    InputError
+        If it does neither (geocentric, vertical alone).
+    """
+    if not (crs.is_projected or crs.is_geographic):
+        raise InputError(f"{crs.name} is neither projected nor geographic: give the cloud's CRS with --crs EPSG:n")
+    return crs
 
 
 def horizontal(crs: CRS) -> CRS:
@@ -83,10 +114,14 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
         A point of the cloud, in ``crs``, x east.
     """
     flat = horizontal(crs)
-    lon, lat = transformer(flat, WGS84).transform(x, y)
+    try:
+        lon, lat = transformer(flat, WGS84).transform(x, y)
+    except ProjError as error:
+        raise InputError(f"{flat.name} can't be brought to WGS 84: give another with --crs") from error
     if not (np.isfinite(lon) and np.isfinite(lat)):
         raise InputError(f"coordinates ({x:.1f}, {y:.1f}) don't lie in {flat.name}: give the right one with --crs")
-    if flat.is_projected and flat.axis_info[0].unit_conversion_factor == 1.0:
+    axes = {axis.direction for axis in flat.axis_info[:2]}
+    if flat.is_projected and flat.axis_info[0].unit_conversion_factor == 1.0 and axes == {"east", "north"}:
         factors = Proj(flat).get_factors(lon, lat)
         if max(abs(factors.meridional_scale - 1), abs(factors.parallel_scale - 1)) < SCALE_TOLERANCE:
             return flat
@@ -106,6 +141,12 @@ def _topocentric(origin: Origin) -> Transformer:
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
         f"+step +proj=topocentric +ellps=WGS84 +lat_0={origin.lat!r} +lon_0={origin.lon!r} +h_0={origin.alt!r}"
     )
+
+
+def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geometry:
+    """Bring a geometry, in two dimensions, from one CRS to another."""
+    convert = transformer(horizontal(source), target).transform
+    return shapely.transform(shapely.force_2d(polygon), lambda xy: np.column_stack(convert(*xy.T)))
 
 
 def to_wgs84(xyz: ArrayLike, crs: CRS) -> NDArray[np.float64]:

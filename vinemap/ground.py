@@ -95,9 +95,7 @@ def terrain_model(
     return surface
 
 
-def _fit_terrain(
-    cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float
-) -> Values:
+def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Values:
     """Terrain (ny, nx) that cells tell, in their own heights."""
     noise = _noise(cells, quantile)
     level = cells.low - noise * _depth(cells.n, quantile) * _soil_share(cells, noise, quantile)
@@ -137,6 +135,10 @@ def _coarse_surface(xyz: Values, grid: Grid) -> Values:
     """Smooth surface (ny, nx) through the low parts of a cloud, blind to what stands on it or floats below."""
     reference = float(np.median(xyz[:, 2]))
     cells = _order_statistics(xyz[:, 2] - reference, cell_of(xyz, grid), grid, 0.05)
+    # Local planes are held to zero where cells are few, so the hillside must be gone first: an upper edge that stood
+    # out above them would be taken for a house.
+    trend = _trend(cells)
+    cells = cells._replace(low=cells.low - trend)
     weight = (cells.n > 0).astype(float)
     surface = np.zeros(grid.shape)
     for sigma in (8.0, 8.0, 5.0, 5.0, 5.0, 4.0, 4.0, 4.0):
@@ -145,7 +147,25 @@ def _coarse_surface(xyz: Values, grid: Grid) -> Values:
         scale = 0.1 + 1.5 * float(np.median(np.abs(above[cells.n > 0])))
         asymmetric = np.where(above > 0, above / scale, above / (5 * scale))
         weight = np.where(cells.n > 0, 1 / (1 + asymmetric**2) ** 2, 0.0)
-    return surface + reference
+    return surface + trend + reference
+
+
+def _trend(cells: _Cells) -> Values:
+    """Quadratic surface (ny, nx) through the cells' low heights, fitted robustly."""
+    ny, nx = cells.n.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    held = cells.n > 0
+    design, low = terms[held], cells.low[held]
+    weight = np.ones(len(low))
+    coefficients = np.zeros(6)
+    for _ in range(10):
+        root = np.sqrt(weight)
+        coefficients = np.linalg.lstsq(design * root[:, None], low * root, rcond=None)[0]
+        off = np.abs(low - design @ coefficients)
+        weight = 1 / (1 + (off / (0.1 + 2 * np.median(off))) ** 2)
+    out: Values = terms @ coefficients
+    return out
 
 
 def _order_statistics(heights: Values, cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:

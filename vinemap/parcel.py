@@ -15,16 +15,20 @@ import numpy as np
 import shapely
 
 from vinemap import __version__, paths
+from vinemap.blocks import group_blocks, outline_blocks
 from vinemap.canopy import find_feet, measure_sections, section_meshes, separate_canopy, summarise_rows
 from vinemap.cgon import enclose
 from vinemap.cloud import PointCloud, Sections, read_cloud
 from vinemap.clustering import cluster_rows
+from vinemap.confidence import judge_rows
 from vinemap.config import Settings, check_name
-from vinemap.crs import Origin, horizontal, to_wgs84, transformer
+from vinemap.crs import Origin, project, to_main, to_wgs84
 from vinemap.curves import trace_rows
+from vinemap.errors import InputError
 from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.mesh import Mesh, write_glb
+from vinemap.missing import count_missing
 from vinemap.raster import Raster, RowField, write_cog
 from vinemap.row_field import canopy_cover, estimate_row_field
 from vinemap.row_fit import fit_rows
@@ -42,6 +46,9 @@ if TYPE_CHECKING:
     Boundary = tuple[shapely.Geometry, CRS]
 
 T = TypeVar("T")
+
+FARTHEST = 50_000.0
+"""Metres from the origin of {Main}, a plane that the globe leaves by then."""
 
 STAGES = (
     "Reading",
@@ -87,6 +94,7 @@ def map_parcel(
     folder: Path,
     *,
     parcel: str,
+    named: bool = True,
     settings: Settings | None = None,
     boundary: Path | None = None,
     crs: CRS | None = None,
@@ -103,6 +111,8 @@ def map_parcel(
         Where the product goes, whole or not at all.
     parcel : str
         Its name, which names its files and follows the numbers of its rows.
+    named : bool
+        Whether the boundary's polygon must have that name, where the file has several; else all of them count.
     settings : Settings, optional
         Settings of the stages.
     boundary : Path, optional
@@ -134,9 +144,14 @@ def map_parcel(
         values: dict[str, Any] = getattr(settings, stage).model_dump()
         return values
 
+    polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
+    inputs = [_fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
-        polygon = read_boundary(boundary, parcel=parcel) if boundary else None
         points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon)
+        if origin and np.abs(to_main(points.xyz[:1], points.crs, origin)[0, :2]).max() > FARTHEST:
+            raise InputError(
+                f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
+            )
         dtm = run("DTM", terrain_model, points, **options("ground"))
         heights = height_above_ground(points, dtm)
         cover = run("Canopy cover", canopy_cover, points, heights, **options("cover"))
@@ -146,7 +161,8 @@ def map_parcel(
         courses = run("Curves", trace_rows, clusters, cover, **options("curves"))
         limits = {"low": settings.cover.low, "high": settings.cover.high}
         fitted = run("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options("fit"))
-        rows, gaps = number_rows(*fitted)
+        rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
+        rows, gaps = count_missing(judge_rows(rows), gaps, **options("missing"))
         sections = run("Sections", cut_sections, points, heights, rows, gaps, dtm, **options("sections"))
         canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
         origin = origin or _corner(dtm)
@@ -173,7 +189,7 @@ def map_parcel(
             "vinemap": __version__,
             "parcel": parcel,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "inputs": [_fingerprint(path) for path in (cloud, boundary) if path],
+            "inputs": inputs,
             "settings": settings.model_dump(mode="json"),
             "crs": points.crs.to_string(),
             "vertical_datum": points.vertical,
@@ -213,28 +229,42 @@ def _labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFra
 def _parcel_layer(
     parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: PointCloud
 ) -> gpd.GeoDataFrame:
-    """The parcel's polygon (the boundary, else the hull of its rows or of the cloud) and its totals."""
-    if boundary:
-        polygon, crs = boundary
-        convert = transformer(horizontal(crs), points.crs).transform
-        polygon = shapely.transform(polygon, lambda xy: np.column_stack(convert(*xy.T)))
-    elif len(rows):
-        polygon = shapely.buffer(shapely.force_2d(rows.union_all()).convex_hull, rows["spacing_m"].median() / 2)
+    """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
+    blocks = outline_blocks(rows)
+    if boundary or len(blocks) == 0:
+        polygon = project(*boundary, points.crs) if boundary else _extent(points)
+        totals = [_totals(parcel, rows, polygon, points)]
+        polygons = [polygon]
     else:
-        polygon = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
+        polygons = list(blocks.geometry)
+        names = [parcel] if len(blocks) == 1 else [f"{parcel} {block}" for block in blocks["block"]]
+        totals = [
+            _totals(name, rows[rows["block"] == block], polygon, points)
+            for name, block, polygon in zip(names, blocks["block"], polygons, strict=True)
+        ]
+    parts = [[p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"] for polygon in polygons]
+    return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
+
+
+def _extent(points: PointCloud) -> shapely.Geometry:
+    polygon: shapely.Geometry = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
+    return polygon
+
+
+def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: PointCloud) -> dict[str, Any]:
     angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
-    totals = {
-        "parcel": parcel,
+    return {
+        "parcel": name,
         "n_rows": len(rows),
         "rows_length_m": rows["length_m"].sum(),
         "area_m2": float(shapely.area(polygon)),
         "spacing_m": rows["spacing_m"].median(),
         "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
         "gap_m": rows["gap_m"].sum(),
+        "n_missing": rows["n_missing"].sum(),
+        "vine_spacing_m": rows["vine_spacing_m"].median(),
         "vertical_datum": points.vertical or "",
     }
-    parts = [part for part in shapely.get_parts(polygon) if part.geom_type == "Polygon"]
-    return gpd.GeoDataFrame([totals], geometry=[shapely.multipolygons(parts)], crs=points.crs)
 
 
 def _write(
@@ -255,7 +285,8 @@ def _write(
         "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
     }
     for kind, (raster, description, unit) in rasters.items():
-        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit)
+        resampling = "nearest" if unit == "degree" else "average"
+        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit, resampling=resampling)
     centre = points.xyz.mean(axis=0)
     write_glb(
         meshes,
@@ -267,6 +298,11 @@ def _write(
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
-    with path.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    try:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror})") from error
     return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import uuid
 from contextlib import contextmanager, suppress
@@ -20,8 +21,8 @@ RUN = "run.json"
 
 
 def stem(cloud: Path) -> str:
-    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``)."""
-    return cloud.stem.removesuffix(".copc")
+    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
+    return re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))[:64] or "cloud"
 
 
 def survey_cloud(survey: str) -> Path:
@@ -71,6 +72,7 @@ def product(target: Path) -> Iterator[Path]:
     OutputError
         If nothing can be written there.
     """
+    target = target.resolve()
     draft = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
     made = [folder for folder in target.parents if not folder.exists()]
     try:
@@ -103,8 +105,15 @@ def _publish(draft: Path, target: Path) -> None:
     elif _replaceable(target, draft):
         old = draft.with_suffix(".old")
         target.rename(old)
-        draft.rename(target)
-        shutil.rmtree(old, ignore_errors=True)
+        try:
+            draft.rename(target)
+        except OSError:
+            # Another run has put its product there meanwhile; if not, the earlier one goes back.
+            with suppress(OSError):
+                old.rename(target)
+            raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
     else:
         run_record(target).unlink(missing_ok=True)
         for path in sorted(draft.iterdir(), key=lambda p: p.name == RUN):

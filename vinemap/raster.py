@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pyproj import CRS
 
-MAX_CELLS = 400_000_000
+MAX_CELLS = 80_000_000
+"""Cells of the finest raster, 0.8 km² at 0.1 m: with what is derived from it they take some 8 GB."""
 NODATA = -9999.0
 
 
@@ -90,7 +91,7 @@ def coarser(grid: Grid, *, resolution: float) -> Grid:
     return Grid(grid.west, grid.north, resolution, ny, nx)
 
 
-def cell_of(xy: NDArray[np.float64], grid: Grid) -> NDArray[np.int64]:
+def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int64]:
     """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
     j = ((xy[:, 0] - grid.west) / grid.resolution).astype(np.int64)
     i = ((grid.north - xy[:, 1]) / grid.resolution).astype(np.int64)
@@ -118,8 +119,16 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     return out
 
 
-def write_cog(raster: Raster, path: Path, *, description: str, unit: str) -> None:
-    """Write a float32 Cloud Optimized GeoTIFF with nodata, overviews, description and unit of its band."""
+def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resampling: str = "average") -> None:
+    """Write a float32 Cloud Optimized GeoTIFF with nodata, overviews, description and unit of its band.
+
+    ``resampling`` makes the overviews: angles have no average, so they want "nearest".
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
     import rasterio  # noqa: PLC0415  (half a second of start-up, needed only here)
     from rasterio.io import MemoryFile  # noqa: PLC0415
     from rasterio.shutil import copy  # noqa: PLC0415
@@ -136,10 +145,13 @@ def write_cog(raster: Raster, path: Path, *, description: str, unit: str) -> Non
         "crs": raster.crs.to_wkt(),
         "transform": Affine(grid.resolution, 0, grid.west, 0, -grid.resolution, grid.north),
     }
-    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile() as memory:
-        with memory.open(**profile) as target:
+    options = {"compress": "DEFLATE", "predictor": "YES", "overview_resampling": resampling}
+    # GDAL writes to memory and Python to the disk, as a full disk would make GDAL talk on the terminal.
+    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile() as plain, MemoryFile() as cog:
+        with plain.open(**profile) as target:
             target.write(values, 1)
             target.set_band_description(1, description)
             target.set_band_unit(1, unit)
             target.update_tags(AREA_OR_POINT="Area")
-        copy(memory.name, path, driver="COG", compress="DEFLATE", predictor="YES", overview_resampling="average")
+        copy(plain.name, cog.name, driver="COG", **options)
+        path.write_bytes(cog.read())

@@ -35,7 +35,7 @@ COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
 TALLEST = 40.0
 """Metres above which nothing stands: points there are birds and noise."""
-WIDEST = 2.25
+WIDEST = 2.0
 """Metres across which no canopy of a row is closed."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
@@ -99,13 +99,20 @@ def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: floa
     Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
     """
     k = max(1, round(COVER_RESOLUTION / resolution))
-    # Summed over 0.75 m, so that a sparse cloud is judged by more than a point or two.
+    cell = k * resolution
+    # Summed over 3 x 3 blocks, so that a sparse cloud is judged by more than a point or two.
     all_, mass, above = (9 * uniform_filter(_blocks(v, k), 3) for v in (everything, canopy + tall, tall))
     high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
-    t = np.hypot(*np.mgrid[-5:6, -5:6]) * COVER_RESOLUTION
-    wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), t <= WIDEST / 2)
-    out: NDArray[np.bool_] = binary_dilation(high | wide, np.hypot(*np.mgrid[-2:3, -2:3]) <= 2.3)
+    wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), _disc(WIDEST / 2, cell))
+    out: NDArray[np.bool_] = binary_dilation(high | wide, _disc(0.5, cell))
     return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
+
+
+def _disc(radius: float, cell: float) -> NDArray[np.bool_]:
+    """Cells whose centre lies within a radius of the middle one's."""
+    n = int(radius / cell)
+    out: NDArray[np.bool_] = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell <= radius
+    return out
 
 
 def _blocks(values: Values, k: int) -> Values:
@@ -145,7 +152,8 @@ def estimate_row_field(
     peaks = _scan(base.values, window, step, (min_spacing, max_spacing))
     peaks = _axial_median(peaks)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
-    return _resample(peaks, grid, base.grid, step, cover)
+    stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
+    return _resample(peaks, grid, base.grid, stride, cover)
 
 
 def _block_mean(raster: Raster, resolution: float) -> Raster:
@@ -164,7 +172,7 @@ def _block_mean(raster: Raster, resolution: float) -> Raster:
 def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
     """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
     size = 2 * round(window / COVER_RESOLUTION / 2)
-    stride = round(step / COVER_RESOLUTION)
+    stride = max(1, round(step / COVER_RESOLUTION))
     # Windows reach over the edge by half their width; what lies there is no canopy.
     my, mx = (n // stride + 2 for n in cover.shape)
     padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)

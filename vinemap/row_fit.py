@@ -41,10 +41,11 @@ VERTEX = 0.5
 
 
 class _Fit(NamedTuple):
-    """Curve (n, 2) between a row's ends, and its runs of canopy (k, 2) in metres along it."""
+    """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast."""
 
     curve: Values
     runs: Values
+    contrast: float
 
 
 class _Points(NamedTuple):
@@ -102,8 +103,9 @@ def fit_rows(
     Returns
     -------
     rows, gaps : GeoDataFrame
-        LineStringZ with ``spacing_m``, ``gap_m`` and ``support`` (share of the length with canopy); LineStringZ with
-        ``row`` (position in rows), ``start_m``, ``end_m``, ``length_m`` along γ.
+        LineStringZ with ``spacing_m``, ``gap_m``, ``support`` (share of the length with canopy) and ``contrast``
+        (of the canopy to the ground beside it, 0–1); LineStringZ with ``row`` (position in rows), ``start_m``,
+        ``end_m``, ``length_m`` along γ.
     """
     curves = [resample(extend(shapely.get_coordinates(line), MARGIN), CELL) for line in courses.geometry]
     half = np.minimum(0.8, 0.42 * courses["spacing_m"].to_numpy())
@@ -132,9 +134,9 @@ def fit_rows(
         empty = empty[np.diff(empty, axis=1)[:, 0] >= min_gap]
         gaps += [(len(rows), a, b, b - a, _line(between(fit.curve, a, b), dtm)) for a, b in empty]
         line = _line(resample(fit.curve, VERTEX), dtm)
-        rows.append((spacing, float(np.diff(empty, axis=1).sum()), float(support), line))
+        rows.append((spacing, float(np.diff(empty, axis=1).sum()), float(support), fit.contrast, line))
     return (
-        _frame(rows, ["spacing_m", "gap_m", "support"], cover),
+        _frame(rows, ["spacing_m", "gap_m", "support", "contrast"], cover),
         _frame(gaps, ["row", "start_m", "end_m", "length_m"], cover),
     )
 
@@ -187,7 +189,11 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     if not runs:
         return None
     metres = np.array(runs) * step
-    return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0])
+    living = image[profile > edge]
+    aside = max(1, living.shape[1] // 8)
+    beside = np.concatenate([living[:, :aside], living[:, -aside:]], axis=1).mean()
+    contrast = float(np.clip(1 - beside / living.max(axis=1).mean(), 0, 1))
+    return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
 
 
 def _line(curve: Values, dtm: Raster) -> shapely.LineString:

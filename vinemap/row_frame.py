@@ -176,4 +176,5 @@ def runs_above(profile: Values, level: float) -> Values:
     rise, fall = np.flatnonzero(above[1:] & ~above[:-1]), np.flatnonzero(~above[1:] & above[:-1])
     start = rise - 1 + (level - padded[rise]) / (padded[rise + 1] - padded[rise])
     end = fall - 1 + (padded[fall] - level) / (padded[fall] - padded[fall + 1])
-    return np.clip(np.column_stack([start, end]), 0, len(profile) - 1)
+    out: Values = np.clip(np.column_stack([start, end]), 0, len(profile) - 1)
+    return out

@@ -8,8 +8,6 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from vinemap.crs import WGS84, to_main, to_wgs84
 
@@ -20,23 +18,17 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
-SAME_BLOCK_DEG = 20.0
-"""Degrees by which neighbouring rows of one block may differ."""
-SAME_BLOCK_SPACINGS = 1.6
-"""Spacings within which rows are neighbours."""
-
 
 def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Give rows their direction and number, and gaps the number of their row.
 
     A curve starts at its western end e1 (its southern one where it runs due north). Rows are numbered from 1 across
-    the rows, from south to north, from west to east where they run rather north–south; rows of one block (neighbours of
-    about one direction) follow each other, blocks from west to east.
+    the rows, from south to north, from west to east where they run rather north–south, block by block.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineStringZ with ``spacing_m``.
+        LineStringZ with ``block``.
     gaps : GeoDataFrame
         LineStringZ with ``row`` (position in rows), ``start_m``, ``end_m`` and ``length_m``.
 
@@ -80,31 +72,17 @@ def _order_across(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
     lines = rows.geometry.to_numpy()
     middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
     angle = np.array([np.arctan2(*_chord(line)[::-1]) for line in lines])
-    block = _blocks(rows, angle)
+    block = rows["block"].to_numpy()
     across = np.empty(len(rows))
-    west = np.empty(len(rows))
     for b in np.unique(block):
         members = block == b
         half = np.angle(np.exp(2j * angle[members]).mean()) / 2
         normal = np.array([-np.sin(half), np.cos(half)])
         # Northwards across rows that run rather west–east, eastwards across those that run rather north–south.
         leading = normal[1] if abs(normal[1]) >= abs(normal[0]) else normal[0]
-        normal = normal if leading > 0 else -normal
-        across[members] = middle[members] @ normal
-        west[members] = middle[members, 0].mean()
-    order: NDArray[np.int64] = np.lexsort((across, west))
+        across[members] = middle[members] @ (normal if leading > 0 else -normal)
+    order: NDArray[np.int64] = np.lexsort((across, block))
     return order
-
-
-def _blocks(rows: gpd.GeoDataFrame, angle: Values) -> NDArray[np.int32]:
-    lines = rows.geometry.to_numpy()
-    reach = SAME_BLOCK_SPACINGS * rows["spacing_m"].to_numpy()
-    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=reach)
-    turn = np.abs(np.angle(np.exp(2j * (angle[i] - angle[j])))) / 2
-    alike = turn < np.radians(SAME_BLOCK_DEG)
-    graph = coo_array((np.ones(alike.sum()), (i[alike], j[alike])), shape=(len(rows), len(rows)))
-    labels: NDArray[np.int32] = connected_components(graph, directed=False)[1]
-    return labels
 
 
 def describe_rows(

@@ -16,6 +16,8 @@ WORDS = {
     "n_rows": "Rows",
     "n_key_points": "Key points",
     "n_points": "Points",
+    "n_missing": "Missing vines",
+    "support": "Share of the length with canopy",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
     "rows_length_m": "Length of all rows (m)",

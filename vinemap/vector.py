@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,6 +10,7 @@ import geopandas as gpd
 import numpy as np
 import pyogrio
 import shapely
+from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap.errors import InputError
 from vinemap.style import layer_styles
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
+PARCEL_LAYER = "parcel"
 TEXT, WHOLE, REAL = "str", "int64", "float64"
 
 
@@ -40,7 +43,8 @@ LAYERS: dict[str, Layer] = {
         | dict.fromkeys(("length_m", "orientation_deg", "elevation_m", "elevation_diff_m"), REAL)
         | {"n_key_points": WHOLE}
         | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
-        | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL),
+        | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL)
+        | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT},
         "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
     ),
     "row_ends": Layer("Point Z", _ROW | {"end": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
@@ -51,14 +55,16 @@ LAYERS: dict[str, Layer] = {
         "Sections across the canopy",
     ),
     "gaps": Layer(
-        "LineString Z", _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL), "Stretches of rows without canopy"
+        "LineString Z",
+        _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE},
+        "Stretches of rows without canopy",
     ),
     "parcel": Layer(
         "MultiPolygon",
         {"parcel": TEXT, "n_rows": WHOLE}
         | dict.fromkeys(("rows_length_m", "area_m2", "spacing_m", "orientation_deg", "gap_m"), REAL)
-        | {"vertical_datum": TEXT},
-        "The parcel",
+        | {"n_missing": WHOLE, "vine_spacing_m": REAL, "vertical_datum": TEXT},
+        "The parcel, or its blocks of one direction and spacing where it was given no boundary",
     ),
 }
 
@@ -79,7 +85,14 @@ def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
 
 
 def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
-    """Write all layers of the contract, and the styles that QGIS applies by itself."""
+    """Write all layers of the contract, and the styles that QGIS applies by itself; OSError if that can't be."""
+    try:
+        _write_layers(layers, path)
+    except (DataSourceError, DataLayerError, FeatureError) as error:
+        raise OSError(f"GeoPackage: {' '.join(str(error).split())}") from error
+
+
+def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
     for name, layer in LAYERS.items():
         with warnings.catch_warnings():
             # An empty column of text has no type of its own to infer.
@@ -101,17 +114,26 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None
 def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geometry, CRS]:
     """Read the polygon of a parcel from GeoPackage, GeoJSON or Shapefile.
 
-    Of several polygons, those count in which a column holds the parcel's name; where none does, all do.
+    Parameters
+    ----------
+    path : Path
+        File whose only layer of polygons, or whose layer ``parcel``, is read.
+    parcel : str, optional
+        Name that one of the polygon's columns holds, where there are several; without a name all of them count.
 
     Raises
     ------
     InputError
-        If the file can't be read, or has no polygon or no CRS.
+        If the file can't be read, has no polygon or no CRS, or none with the parcel's name.
     """
-    if not path.exists():
+    if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        frame = gpd.read_file(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GDAL's remarks on odd files
+            frame = gpd.read_file(path, layer=_polygon_layer(path))
+    except InputError:
+        raise
     except Exception as error:  # GDAL's errors come in several classes
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON or Shapefile ({reason})") from error
@@ -120,9 +142,24 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
     if len(frame) == 0:
         raise InputError(f"{path}: holds no polygon")
-    named = frame[(frame.drop(columns="geometry").astype(str) == parcel).any(axis=1)]
-    chosen = named if len(named) else frame
-    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(chosen.geometry.to_numpy())))
-    if not np.isfinite(polygon.bounds).all():
+    if parcel is not None and len(frame) > 1:
+        columns = frame.drop(columns="geometry").astype(str)
+        named = frame[(columns == parcel).any(axis=1)]
+        if len(named) == 0:
+            words = sorted({word for name in columns for word in columns[name] if word not in ("None", "nan")})
+            close = difflib.get_close_matches(parcel, words, n=1, cutoff=0.5)
+            hint = f"did you mean {close[0]!r}?" if close else "check the name"
+            raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
+        frame = named
+    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy())))
+    if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
     return shapely.force_2d(polygon), frame.crs
+
+
+def _polygon_layer(path: Path) -> str:
+    kinds = {str(name): str(kind) for name, kind in pyogrio.list_layers(path)}
+    polygons = [name for name, kind in kinds.items() if "Polygon" in kind] or list(kinds)
+    if len(polygons) > 1 and PARCEL_LAYER not in polygons:
+        raise InputError(f"{path}: has several layers of polygons ({', '.join(polygons)}): save the parcels' alone")
+    return PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0]

@@ -1,0 +1,103 @@
+"""Blocks, missing vines, and how sure a row is."""
+
+import geopandas as gpd
+import numpy as np
+import pytest
+import shapely
+
+from vinemap.blocks import group_blocks, outline_blocks
+from vinemap.confidence import judge_rows
+from vinemap.missing import count_missing, estimate_vine_spacing
+
+
+def rows_frame(lines, spacing=2.5, **columns):
+    table = {"spacing_m": np.broadcast_to(spacing, len(lines))} | columns
+    return gpd.GeoDataFrame(table, geometry=[shapely.LineString(c) for c in lines], crs=32632)
+
+
+def parallel(n, azimuth, at, length=30.0, spacing=2.5):
+    angle = np.radians(azimuth)
+    way, normal = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    return [np.array([at + k * spacing * normal, at + k * spacing * normal + length * way]) for k in range(n)]
+
+
+def test_blocks_of_other_direction_spacing_or_beyond_a_track_are_apart():
+    blocks = [
+        parallel(5, 0, np.array([0, 0])),
+        parallel(5, 0, np.array([36, 0])),  # in line with the first, across a track of 6 m
+        parallel(5, 70, np.array([75, 0])),
+        parallel(4, 0, np.array([0, 13.5]), spacing=3.2),
+    ]
+    spacing = np.repeat([2.5, 2.5, 2.5, 3.2], [5, 5, 5, 4])
+    found = group_blocks(rows_frame([line for block in blocks for line in block], spacing))
+    assert found["block"].nunique() == 4
+    assert found.groupby(spacing.cumsum() * 0 + np.repeat([0, 1, 2, 3], [5, 5, 5, 4]))["block"].nunique().eq(1).all()
+    west = found.groupby("block").apply(lambda b: b.geometry.centroid.x.mean(), include_groups=False)
+    assert west.is_monotonic_increasing
+
+
+def test_outline_is_the_ground_that_rows_take():
+    truth = shapely.box(0, -1.25, 30, 11.25)
+    outline = outline_blocks(group_blocks(rows_frame(parallel(5, 0, np.array([0, 0])))))
+    assert len(outline) == 1
+    polygon = outline.geometry.iloc[0]
+    assert polygon.intersection(truth).area / polygon.union(truth).area > 0.98
+    assert outline_blocks(group_blocks(rows_frame([]))).empty
+
+
+def gaps_of(rng, spacing, n_rows=15, n_vines=100, dead=0.05, jitter=0.05):
+    records = []
+    for row in range(1, n_rows + 1):
+        alive = rng.random(n_vines) > dead
+        alive[[0, -1]] = True
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], alive, [True]]).astype(int)))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            start, end = (spacing * np.array([a, b]) + rng.normal(0, jitter, 2)).tolist()
+            records.append((row, start, end, end - start, b - a))
+    table = np.array(records)
+    names = ["row_id", "start_m", "end_m", "length_m", "truth"]
+    return gpd.GeoDataFrame(dict(zip(names, table.T, strict=True)), geometry=[None] * len(table)).astype(
+        {"row_id": int}
+    )
+
+
+@pytest.mark.parametrize("spacing", [0.8, 0.905, 1.0, 1.2, 1.5])
+def test_vine_spacing_and_missing_vines_from_gaps(spacing):
+    gaps = gaps_of(np.random.default_rng(0), spacing)
+    assert estimate_vine_spacing(gaps) == pytest.approx(spacing, rel=0.005)
+    rows = rows_frame(parallel(15, 0, np.array([0, 0])), row_id=np.arange(1, 16))
+    rows, counted = count_missing(rows, gaps)
+    assert (counted["n_missing"] == counted["truth"]).all()
+    assert rows["n_missing"].sum() == counted["truth"].sum()
+    assert rows["vine_spacing_m"].iloc[0] == pytest.approx(spacing, rel=0.005)
+
+
+def test_no_order_no_vine_spacing():
+    rng = np.random.default_rng(0)
+    start = rng.uniform(0, 100, 60)
+    gaps = gpd.GeoDataFrame(
+        {"row_id": np.repeat(np.arange(1, 16), 4), "start_m": start, "end_m": start + rng.uniform(0.8, 4, 60)},
+        geometry=[None] * 60,
+    )
+    gaps["length_m"] = gaps["end_m"] - gaps["start_m"]
+    assert estimate_vine_spacing(gaps) is None
+    rows = rows_frame(parallel(15, 0, np.array([0, 0])), row_id=np.arange(1, 16))
+    assert count_missing(rows, gaps)[0]["vine_spacing_m"].iloc[0] == 1.0
+    assert count_missing(rows, gaps, vine_spacing=1.3)[0]["vine_spacing_m"].iloc[0] == 1.3
+
+
+def test_flags_and_confidence():
+    lines = parallel(6, 0, np.array([0, 0]), length=60.0)
+    lines[2] = lines[2] + [0, 1.5]
+    lines[4] = lines[4] * [0.3, 1]
+    t = np.linspace(0, 60, 50)
+    lines[0] = np.column_stack([t, -1.5 * np.sin(np.pi * t / 60)])
+    support = np.array([0.95, 0.95, 0.95, 0.3, 0.95, 0.95])
+    found = judge_rows(rows_frame(lines, block=1, support=support, contrast=1.0))
+    assert [f.split(",") if f else [] for f in found["flags"]] == [
+        ["curved"], [], ["spacing"], ["sparse", "spacing"], ["short"], [],
+    ]  # fmt: skip
+    assert found["confidence"].between(0, 1).all()
+    assert found["confidence"].idxmin() == 3
+    assert found["confidence"].drop(3).min() > 0.9
+    assert judge_rows(rows_frame([], block=1, support=1.0, contrast=1.0)).empty
