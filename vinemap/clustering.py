@@ -205,7 +205,11 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
 
 
 def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
-    """Whether the gap between two ends (k, 2) goes on between the neighbouring rows, which stand on both its sides."""
+    """Whether the gap between two ends (k, 2) goes on through the neighbouring rows.
+
+    Of the three rows on each side, those count that stand before the gap and after it. It is a track if three in four
+    of them are empty beside it.
+    """
     tree = cKDTree(xy)
     out = np.zeros(len(pairs), dtype=bool)
     for k, (a, b) in enumerate(pairs):
@@ -215,19 +219,14 @@ def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width
             continue
         spacing = float(ends.spacing[[a, b]].mean())
         middle = (ends.xy[a] + ends.xy[b]) / 2
-        near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 3 * spacing)] - ends.xy[a]
+        near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 4 * spacing)] - ends.xy[a]
         x = near @ gap / length
-        y = (gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing
-        shares = []
-        for side in (1, -1):
-            beside = x[(side * y > 0.5) & (side * y < 2.6)]
-            before, inside, after = (
-                _covered(beside, low, high)
-                for low, high in ((-FLANK, 0), (0.5, length - 0.5), (length, length + FLANK))
-            )
-            if before > 0.5 and after > 0.5:
-                shares.append(inside)
-        out[k] = bool(shares) and max(shares) < 0.3
+        rank = np.rint((gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing)
+        empty = []
+        for beside in (x[rank == r] for r in (-3, -2, -1, 1, 2, 3)):
+            if min(_covered(beside, -FLANK, 0), _covered(beside, length, length + FLANK)) > 0.5:
+                empty.append(_covered(beside, 0.5, length - 0.5) < 0.3)
+        out[k] = bool(empty) and np.mean(empty) >= 0.75
     return out
 
 

@@ -30,6 +30,8 @@ CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
+POINTS_A_METRE = 200.0
+"""Canopy points in a metre of row for which the smoothing is meant."""
 RAMP = 0.1
 """Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
 REACH = 0.2
@@ -94,7 +96,8 @@ def fit_rows(
     low, high : float
         Heights in metres between which points count as canopy.
     smoothing : float
-        Wavelength in metres below which bends of the centre line are taken for noise.
+        Wavelength in metres below which bends of the centre line are taken for noise, at 200 canopy points a metre of
+        row; it grows with the fifth root of their distance.
     end_share : float
         Share of the row's median cover at which its canopy begins and ends.
     min_gap : float
@@ -118,9 +121,10 @@ def fit_rows(
             points, shares = _deal(points, curves, half)
             for k, share in enumerate(shares):
                 shift = np.zeros(len(curves[k]))
+                cutoff = smoothing / CELL * _noise_stretch(share, half[k])
                 for _ in range(passes):
                     image, offsets = _straighten(share, shift, half[k])
-                    shift = shift + centre_line(image, offsets, reach=0.75 * half[k], cutoff=smoothing / CELL)
+                    shift = shift + centre_line(image, offsets, reach=0.75 * half[k], cutoff=cutoff)
                 curves[k], shares[k] = _shifted(curves[k], shift), share
                 if passes == 1:
                     fits.append(_ends(curves[k], _straighten(share, shift, half[k])[0], end_share))
@@ -152,6 +156,12 @@ def _deal(points: _Points, curves: Sequence[Values], half: Values) -> tuple[_Poi
         station = near.along[mine] / way_along(curve)[-1] * (len(curve) - 1)
         shares.append(_Share(station, near.left[mine], points.canopy[near.member[mine]], len(curve)))
     return _Points(points.xyz[near.member], points.canopy[near.member]), shares
+
+
+def _noise_stretch(share: _Share, half: float) -> float:
+    """Factor of the smoothing's wavelength: 1 at ``POINTS_A_METRE``, more where points are fewer."""
+    per_metre = float(share.canopy[np.abs(share.left) <= half].sum()) / (share.n * CELL)
+    return float(np.clip((POINTS_A_METRE / max(per_metre, 1.0)) ** 0.2, 0.8, 1.6))
 
 
 def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:

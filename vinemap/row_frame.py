@@ -140,7 +140,7 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
             trusted = weight * robust
             trend = whittaker(measured, trusted, cutoff=TREND * cutoff)
             # Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
-            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, ridge=0.02)
+            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, ridge=0.3)
             residual = np.abs(measured - centre)
             scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
             robust = 1 / (1 + (residual / (2 * scale)) ** 2)
@@ -164,7 +164,7 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, ridge: float = 
     bands[1, 1:-1] += -2 * penalty
     bands[1, 2:] += -2 * penalty
     bands[0, 2:] += penalty
-    bands[2] += weights + max(ridge, 1e-9) * level
+    bands[2] += weights + np.where(weights < 0.1 * level, max(ridge, 1e-9), 1e-9) * level
     out: Values = solveh_banded(bands, weights * values)
     return out
 
