@@ -12,12 +12,18 @@ import shapely.affinity
 import shapely.ops
 from click.testing import CliRunner
 
-from vinemap.accuracy import COLUMNS, Map, as_markdown, as_text, compare, main, measure, pool, table
+from vinemap.accuracy import COLUMNS, as_markdown, as_text, compare, main, measure, pool, table
+from vinemap.parcel import RowMap
 from vinemap.raster import Grid, Raster, RowField
 from vinemap.scenes import hillside, rows_of
 from vinemap.synthetic import Vineyard, simulate
 
 AZIMUTH, SPACING = 40.0, 2.4
+
+
+def found(survey, dtm, field):
+    """A map that holds the survey's true rows and gaps."""
+    return RowMap(dtm, np.zeros(1), field.likelihood, field, 0, survey.rows[["geometry"]], survey.gaps[["geometry"]])
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +44,7 @@ def perfect(survey):
 
     field = RowField(raster(AZIMUTH), raster(SPACING), raster(1.0))
     dtm = Raster(survey.terrain(x, y), grid, survey.rows.crs)
-    return Map(survey.rows[["geometry"]], survey.gaps[["geometry"]], dtm, raster(0.0), field)
+    return found(survey, dtm, field)
 
 
 def numbers(errors):
@@ -114,7 +120,7 @@ def test_spacing_is_that_of_a_fan():
     middle = survey.parcels.total_bounds[[0, 2]].mean()
     wanted = 2.5 + 2 * np.tan(np.radians(1)) * (x - middle)
     values = [Raster(v, grid, survey.rows.crs) for v in (np.zeros_like(x), wanted, np.ones_like(x))]
-    errors, _ = compare(survey, Map(survey.rows, survey.gaps, values[0], values[0], RowField(*values)))
+    errors, _ = compare(survey, found(survey, values[0], RowField(*values)))
     assert np.quantile(errors.spacing, 0.95) < 0.02
     assert np.median(errors.direction) == pytest.approx(2, abs=0.3)
 

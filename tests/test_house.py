@@ -43,7 +43,7 @@ MAY_IMPORT = {
     "scenes": BASE | {"synthetic"},
     **dict.fromkeys(SETTINGS, BASE),
     "parcel": CHAIN,
-    "accuracy": CHAIN,
+    "accuracy": CHAIN | {"parcel"},
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
     "flows": CHAIN | {"parcel", "cli", "flows"},

@@ -34,7 +34,7 @@ def axial(a, b):
 @pytest.mark.parametrize("spacing", [1.8, 2.5, 3.5])
 def test_direction_and_spacing_of_stripes(direction, spacing):
     field = estimate_row_field(stripes(direction, spacing))
-    middle = (slice(12, -12), slice(12, -12))
+    middle = (slice(24, -24), slice(24, -24))
     assert axial(field.direction.values[middle], direction).max() < 0.5
     assert np.abs(field.spacing.values[middle] / spacing - 1).max() < 0.02
     assert field.likelihood.values[middle].min() > 0.4

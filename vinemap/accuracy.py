@@ -18,15 +18,10 @@ import pandas as pd
 import shapely
 
 from vinemap.cloud import PointCloud
-from vinemap.clustering import cluster_rows
 from vinemap.config import Settings
-from vinemap.curves import trace_rows
 from vinemap.evaluate import evaluate_rows
-from vinemap.ground import height_above_ground, terrain_model
-from vinemap.key_points import detect_key_points
+from vinemap.parcel import RowMap, map_rows
 from vinemap.raster import Raster, RowField, cell_of, sample
-from vinemap.row_field import canopy_cover, estimate_row_field
-from vinemap.row_fit import fit_rows
 from vinemap.scenes import FAMILIES, family
 
 if TYPE_CHECKING:
@@ -45,16 +40,6 @@ NEAR = 0.8
 LONG = 1.5
 """Metres from which a gap is one of two vines or more."""
 PROCESSES = 2
-
-
-class Map(NamedTuple):
-    """What the chain finds in a cloud, as far as the rows."""
-
-    rows: gpd.GeoDataFrame
-    gaps: gpd.GeoDataFrame
-    dtm: Raster
-    cover: Raster
-    field: RowField
 
 
 class Errors(NamedTuple):
@@ -149,21 +134,7 @@ EASED = {("thin", "DEP m", "mean"): 0.10, ("terraces", "DTM m", "median"): 0.03,
 """Bars that are lower for a family."""
 
 
-def map_rows(cloud: PointCloud, settings: Settings) -> Map:
-    """Run the chain on a cloud as far as the rows."""
-    dtm = terrain_model(cloud, **settings.ground.model_dump())
-    heights = height_above_ground(cloud, dtm)
-    cover = canopy_cover(cloud, heights, **settings.cover.model_dump())
-    field = estimate_row_field(cover, **settings.row_field.model_dump())
-    key_points = detect_key_points(cover, dtm, field, **settings.key_points.model_dump())
-    clusters = cluster_rows(key_points, **settings.clustering.model_dump())
-    courses = trace_rows(clusters, cover, **settings.curves.model_dump())
-    limits = {"low": settings.cover.low, "high": settings.cover.high}
-    rows, gaps = fit_rows(courses, cloud, heights, cover, dtm, **limits, **settings.fit.model_dump())
-    return Map(rows, gaps, dtm, cover, field)
-
-
-def compare(survey: Survey, found: Map) -> tuple[Errors, Worst | None]:
+def compare(survey: Survey, found: RowMap) -> tuple[Errors, Worst | None]:
     """Hold a map against the truth of its survey; the worst row is None if there is no row at all."""
     evaluation = evaluate_rows(found.rows[["geometry"]], survey.rows[["geometry"]])
     truth = shapely.force_2d(survey.rows.geometry.to_numpy())
@@ -275,7 +246,7 @@ def measure(name: str, seeds: int, out: Path | None = None) -> Errors:
     return pool([errors for errors, *_ in cases])
 
 
-def draw(worst: Worst | None, survey: Survey, found: Map, title: str, path: Path) -> None:
+def draw(worst: Worst | None, survey: Survey, found: RowMap, title: str, path: Path) -> None:
     """Draw a map, and its worst row straightened and at both ends, over the canopy cover."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - a tool of development
 
@@ -297,7 +268,7 @@ def draw(worst: Worst | None, survey: Survey, found: Map, title: str, path: Path
     figure.savefig(path, dpi=90)
 
 
-def _draw_plan(axes: Axes, survey: Survey, found: Map, width: float) -> None:
+def _draw_plan(axes: Axes, survey: Survey, found: RowMap, width: float) -> None:
     grid = found.cover.grid
     east, south = grid.west + grid.nx * grid.resolution, grid.north - grid.ny * grid.resolution
     axes.imshow(found.cover.values, extent=(grid.west, east, south, grid.north), cmap="Greys", vmin=0, vmax=1, zorder=0)
@@ -308,7 +279,7 @@ def _draw_plan(axes: Axes, survey: Survey, found: Map, width: float) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: Map, reach: float = 3.0) -> None:
+def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: RowMap, reach: float = 3.0) -> None:
     """Draw what lies along a line, across it exaggerated."""
     xy = shapely.get_coordinates(line.segmentize(0.25))
     for k, other in ((0, 1), (-1, -2)):

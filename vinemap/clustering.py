@@ -222,10 +222,11 @@ def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width
         near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 4 * spacing)] - ends.xy[a]
         x = near @ gap / length
         rank = np.rint((gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing)
-        empty = []
-        for beside in (x[rank == r] for r in (-3, -2, -1, 1, 2, 3)):
-            if min(_covered(beside, -FLANK, 0), _covered(beside, length, length + FLANK)) > 0.5:
-                empty.append(_covered(beside, 0.5, length - 0.5) < 0.3)
+        empty = [
+            _covered(beside, 0.5, length - 0.5) < 0.3
+            for beside in (x[rank == r] for r in (-3, -2, -1, 1, 2, 3))
+            if min(_covered(beside, -FLANK, 0), _covered(beside, length, length + FLANK)) > 0.5
+        ]
         out[k] = bool(empty) and np.mean(empty) >= 0.75
     return out
 

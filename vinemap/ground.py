@@ -117,7 +117,7 @@ def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
     return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
 
 
-def canopy_height_model(cloud: PointCloud, heights: Values, *, resolution: float = 0.25) -> Raster:
+def canopy_height_model(cloud: PointCloud, heights: NDArray[np.floating], *, resolution: float = 0.25) -> Raster:
     """Canopy height model: the 98% height in metres of each cell's points, NaN where there is none.
 
     A cell stands no higher than the highest of its eight neighbours by more than ``SPIKE``, so that a point in the

@@ -30,7 +30,7 @@ from vinemap.key_points import detect_key_points
 from vinemap.mesh import Mesh, write_glb
 from vinemap.missing import count_missing
 from vinemap.raster import Raster, RowField, write_cog
-from vinemap.row_field import canopy_cover, estimate_row_field
+from vinemap.row_field import canopy_cover, estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.sections import cut_sections
@@ -87,6 +87,40 @@ def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
     """Run a stage as it is."""
     del name
     return function(*args, **kwargs)
+
+
+class RowMap(NamedTuple):
+    """Rows and gaps of a cloud, and what they were found from."""
+
+    dtm: Raster
+    heights: NDArray[np.floating]
+    """Height above ground (n,) of every point in metres."""
+    cover: Raster
+    field: RowField
+    n_key_points: int
+    rows: gpd.GeoDataFrame
+    gaps: gpd.GeoDataFrame
+
+
+def map_rows(points: PointCloud, settings: Settings, *, step: Callable[..., Any] = call) -> RowMap:
+    """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2)."""
+
+    def options(stage: str) -> dict[str, Any]:
+        values: dict[str, Any] = getattr(settings, stage).model_dump()
+        return values
+
+    dtm = step("DTM", terrain_model, points, **options("ground"))
+    heights = height_above_ground(points, dtm)
+    cover = step("Canopy cover", canopy_cover, points, heights, **options("cover"))
+    field = step("Row field", estimate_row_field, cover, **options("row_field"))
+    key_points = step("Key points", detect_key_points, cover, dtm, field, **options("key_points"))
+    clusters = step("Clusters", cluster_rows, key_points, **options("clustering"))
+    courses = step("Curves", trace_rows, clusters, cover, **options("curves"))
+    limits = {"low": settings.cover.low, "high": settings.cover.high}
+    fitted = step("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options("fit"))
+    rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
+    rows, gaps = count_missing(judge_rows(rows), gaps, **options("missing"))
+    return RowMap(dtm, heights, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 
 def map_parcel(
@@ -152,20 +186,11 @@ def map_parcel(
             raise InputError(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
             )
-        dtm = run("DTM", terrain_model, points, **options("ground"))
-        heights = height_above_ground(points, dtm)
-        cover = run("Canopy cover", canopy_cover, points, heights, **options("cover"))
-        field = run("Row field", estimate_row_field, cover, **options("row_field"))
-        key_points = run("Key points", detect_key_points, cover, dtm, field, **options("key_points"))
-        clusters = run("Clusters", cluster_rows, key_points, **options("clustering"))
-        courses = run("Curves", trace_rows, clusters, cover, **options("curves"))
-        limits = {"low": settings.cover.low, "high": settings.cover.high}
-        fitted = run("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options("fit"))
-        rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
-        rows, gaps = count_missing(judge_rows(rows), gaps, **options("missing"))
-        sections = run("Sections", cut_sections, points, heights, rows, gaps, dtm, **options("sections"))
+        found = map_rows(points, settings, step=run)
+        heights, rows, gaps = found.heights, found.rows, found.gaps
+        sections = run("Sections", cut_sections, points, heights, rows, gaps, found.dtm, **options("sections"))
         canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
-        origin = origin or _corner(dtm)
+        origin = origin or _corner(found.dtm)
         rows, ends, enhanced = describe_rows(
             summarise_rows(rows, table, step=settings.sections.step),
             parcel=parcel,
@@ -182,8 +207,8 @@ def map_parcel(
             "parcel": _parcel_layer(parcel, rows, polygon, points),
         }
         chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
-        run("Writing", _write, draft, parcel, layers, (dtm, chm), field, meshes, points)
-        counts = {"points": len(points.xyz), "key_points_found": len(key_points)}
+        run("Writing", _write, draft, parcel, layers, (found.dtm, chm), found.field, meshes, points)
+        counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         record = {
             "vinemap": __version__,

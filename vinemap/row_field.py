@@ -6,9 +6,11 @@ spectrum lies across the rows at one cycle a spacing (Delenne et al. 2008; the t
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import rfft2
 from scipy.ndimage import (
@@ -19,17 +21,19 @@ from scipy.ndimage import (
     maximum_filter,
     uniform_filter,
 )
+from scipy.spatial import cKDTree
 
 from vinemap.raster import Grid, Raster, RowField, cell_of, coarser, count, grid_over
 
 if TYPE_CHECKING:
+    import geopandas as gpd
     from numpy.typing import NDArray
 
     from vinemap.cloud import PointCloud
 
     Values = NDArray[np.floating]
 
-FIELD_RESOLUTION = 1.0
+FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
 COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
@@ -289,3 +293,59 @@ def _resample(peaks: _Peaks, grid: Grid, base: Grid, step: float, cover: Raster)
     return RowField(
         raster(np.where(known, direction, np.nan)), raster(np.where(known, spacing, np.nan)), raster(likelihood)
     )
+
+
+def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
+    """Take direction and spacing within the vineyard from the rows that were found.
+
+    A window's wave is a mean over some rows; a row's own tangent (over 4 m) and its distance from the rows beside it
+    are exact where rows bend, converge, or stand alone.
+
+    Parameters
+    ----------
+    field : RowField
+        As estimated from the spectrum.
+    rows : GeoDataFrame
+        LineString with ``spacing_m``.
+    """
+    if len(rows) == 0:
+        return field
+    lines = shapely.force_2d(rows.geometry.to_numpy())
+    at = [np.linspace(0, line.length, max(2, round(2 * line.length) + 1)) for line in lines]
+    row = np.repeat(np.arange(len(lines)), [len(a) for a in at])
+    position = np.concatenate(at)
+    here, before, after = (
+        shapely.get_coordinates(shapely.line_interpolate_point(lines[row], np.clip(position + d, 0, None)))
+        for d in (0.0, -2.0, 2.0)
+    )
+    chord = after - before
+    direction = np.mod(np.degrees(np.arctan2(chord[:, 1], chord[:, 0])), 180)
+    spacing = _spacing_beside(here, chord, row, rows["spacing_m"].to_numpy()[row])
+
+    grid = field.direction.grid
+    centres = np.stack(np.meshgrid(*grid.centres()), axis=-1)
+    distance, nearest = cKDTree(here).query(centres)
+    inside = distance <= 0.6 * rows["spacing_m"].to_numpy()[row][nearest]
+    known = inside & np.isfinite(spacing)[nearest]
+    return RowField(
+        replace(field.direction, values=np.where(inside, direction[nearest], field.direction.values)),
+        replace(field.spacing, values=np.where(known, spacing[nearest], field.spacing.values)),
+        field.likelihood,
+    )
+
+
+def _spacing_beside(here: Values, chord: Values, row: NDArray[np.int64], expected: Values) -> Values:
+    """Mean distance in metres (n,) from points of rows to the rows on both sides, NaN where there is none."""
+    tree = cKDTree(here)
+    way = chord / np.hypot(*chord.T)[:, None]
+    out = np.full(len(here), np.nan)
+    for i, near in enumerate(tree.query_ball_point(here, 1.8 * expected)):
+        other = np.array([j for j in near if row[j] != row[i]], dtype=np.int64)
+        offset = here[other] - here[i]
+        along, left = offset @ way[i], way[i, 0] * offset[:, 1] - way[i, 1] * offset[:, 0]
+        beside = np.abs(along) <= 0.75
+        sides = [np.abs(left[beside & (side * left > 0.3)]) for side in (1, -1)]
+        reached = [side.min() for side in sides if len(side)]
+        if reached:
+            out[i] = np.mean(reached)
+    return out

@@ -75,7 +75,7 @@ def fit_rows(
     *,
     low: float = 0.5,
     high: float = 2.9,
-    smoothing: float = 3.0,
+    smoothing: float = 4.0,
     end_share: float = 0.5,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
