@@ -207,8 +207,8 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
 def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
     """Whether the gap between two ends (k, 2) goes on through the neighbouring rows.
 
-    Of the three rows on each side, those count that stand before the gap and after it. It is a track if three in four
-    of them are empty beside it.
+    It is a track if most of the three rows on each side stand before the gap and after it, and three in four of
+    those are empty beside it.
     """
     tree = cKDTree(xy)
     out = np.zeros(len(pairs), dtype=bool)
@@ -222,12 +222,14 @@ def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width
         near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 4 * spacing)] - ends.xy[a]
         x = near @ gap / length
         rank = np.rint((gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing)
+        beside = [x[rank == r] for r in (-3, -2, -1, 1, 2, 3)]
+        beside = [row for row in beside if _covered(row, -FLANK, length + FLANK) > 0.2]
         empty = [
-            _covered(beside, 0.5, length - 0.5) < 0.3
-            for beside in (x[rank == r] for r in (-3, -2, -1, 1, 2, 3))
-            if min(_covered(beside, -FLANK, 0), _covered(beside, length, length + FLANK)) > 0.5
+            _covered(row, 0.5, length - 0.5) < 0.3
+            for row in beside
+            if min(_covered(row, -FLANK, 0), _covered(row, length, length + FLANK)) > 0.5
         ]
-        out[k] = bool(empty) and np.mean(empty) >= 0.75
+        out[k] = len(empty) > 0.5 * len(beside) and np.mean(empty) >= 0.75
     return out
 
 

@@ -25,16 +25,22 @@ STATION = 0.1
 """Metres between the stations of a straightened row."""
 BIN = 0.05
 """Metres between its cells across."""
+LONE_WIDTH, LONE_SHARE = 0.85, 0.25
+"""Metres of canopy across beyond which, and share of the median length below which, a row with no other beside it is
+a hedge or a bush."""
+LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
+"""Canopy and width of a row, in those of the parcel's typical row."""
 SMOOTHING = 3.0
 """Wavelength in metres below which bends of a course are noise."""
 
 
 class _Course(NamedTuple):
-    """Curve (n, 2), width of its canopy in metres, and share of its length that has canopy."""
+    """Curve (n, 2), width of its canopy in metres, share of its length with canopy, and canopy on a metre of it."""
 
     curve: Values
     width: float
     support: float
+    amount: float
 
 
 def trace_rows(
@@ -58,7 +64,7 @@ def trace_rows(
     threshold : float
         Metres t between enhanced key points.
     min_length : float
-        Metres that a row must have; twice as many where no other row runs beside it.
+        Metres that a row must have; twice as many, and a quarter of the median row, where no other runs beside it.
     min_radius : float
         Radius in metres of the tightest bend that a row takes as a whole.
     max_width : float
@@ -82,12 +88,18 @@ def trace_rows(
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
         if slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius:
-            records.append((spacing, line))
+            records.append((spacing, course.width, course.amount, line))
+    columns = ("spacing_m", "width", "amount")
     rows = gpd.GeoDataFrame(
-        {"spacing_m": [r[0] for r in records]}, geometry=[r[1] for r in records], crs=key_points.crs
+        {name: [r[k] for r in records] for k, name in enumerate(columns)},
+        geometry=[r[-1] for r in records],
+        crs=key_points.crs,
     )
     rows = rows[~_repeated(rows)]
-    return rows[_accompanied(rows) | (rows.length >= 2 * min_length)].reset_index(drop=True)
+    rows = rows[_like_the_others(rows)]
+    least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
+    odd = ~_accompanied(rows) & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
+    return rows.loc[~odd, ["spacing_m", "geometry"]].reset_index(drop=True)
 
 
 def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -> Values:
@@ -155,7 +167,8 @@ def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
         return None
     width = float(np.median(present)) / max(float(np.quantile(image.max(axis=1), 0.9)), 1e-6)
     support = float(np.diff(runs, axis=1).sum()) / (runs[-1, 1] - runs[0, 0])
-    return _Course(between(curve, runs[0, 0], runs[-1, 1]), width, support)
+    amount = float(profile[round(runs[0, 0] / STATION) : round(runs[-1, 1] / STATION) + 1].mean())
+    return _Course(between(curve, runs[0, 0], runs[-1, 1]), width, support, amount)
 
 
 def _straighten(cover: Raster, curve: Values, half: float) -> tuple[Values, Values]:
@@ -186,6 +199,19 @@ def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     return out
 
 
+def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
+    """Whether a row has about as much canopy as most: no wire between posts, no hedge."""
+    if len(rows) < 3:
+        return np.ones(len(rows), dtype=bool)
+    order = np.argsort(rows["amount"].to_numpy())
+    half = np.cumsum(rows.length.to_numpy()[order]) >= 0.5 * rows.length.sum()
+    typical = rows.iloc[order[np.argmax(half)]]
+    thin = rows["amount"] < LEAST_AMOUNT * typical["amount"]
+    wide = rows["width"] > MOST_WIDTH * typical["width"]
+    out: NDArray[np.bool_] = ~(thin | wide).to_numpy()
+    return out
+
+
 def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     """Whether another row of about the same direction lies within two spacings of each."""
     lines = rows.geometry.to_numpy()
@@ -194,7 +220,9 @@ def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
         return out
     chord = np.array([np.diff(shapely.get_coordinates(line)[[0, -1]], axis=0)[0] for line in lines])
     angle = np.arctan2(chord[:, 1], chord[:, 0])
-    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=2 * rows["spacing_m"].to_numpy())
+    # Away from the rows their spacing is a guess: it is the parcel's that counts.
+    reach = 2 * np.minimum(rows["spacing_m"], rows["spacing_m"].median()).to_numpy()
+    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=reach)
     parallel = np.abs(np.sin(angle[i] - angle[j])) < np.sin(np.radians(20))
     out[i[parallel & (i != j)]] = True
     return out

@@ -168,7 +168,7 @@ def _trend(cells: _Cells) -> Values:
     return out
 
 
-def _order_statistics(heights: Values, cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
+def _order_statistics(heights: NDArray[np.floating], cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
     """Quantiles of heights in cells: one sort of integers that hold the cell above and the height below."""
     lowest = -500.0
     steps = np.clip((heights - lowest) / STEP, 0, 2**20 - 1).astype(np.int64)

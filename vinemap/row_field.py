@@ -283,7 +283,7 @@ def _resample(peaks: _Peaks, grid: Grid, base: Grid, step: float, cover: Raster)
     direction = np.mod(np.degrees(np.angle(at(wave.real) + 1j * at(wave.imag)) / 2), 180)
     weight = at(strength**2)
     spacing = at(strength**2 * np.nan_to_num(peaks.spacing)) / np.maximum(weight, 1e-12)
-    near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, size=5) > 0.02
+    near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, size=round(5 / FIELD_RESOLUTION) + 1) > 0.02
     likelihood = np.where(near, at(strength), 0.0)
     known = weight > 1e-9
 
