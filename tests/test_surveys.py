@@ -25,7 +25,8 @@ def product(shared, tmp_path_factory):
         if name not in done:
             source = shared / "surveys" / name
             folder = tmp_path_factory.mktemp("products") / name
-            map_parcel(source / f"{name}.laz", folder, parcel=name, boundary=source / "boundary.gpkg", origin=ORIGIN)
+            origin = ORIGIN if name == "parcelF" else None
+            map_parcel(source / f"{name}.laz", folder, parcel=name, boundary=source / "boundary.gpkg", origin=origin)
             done[name] = folder
         return done[name]
 

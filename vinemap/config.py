@@ -107,7 +107,7 @@ class CurveOptions(Options):
 class FitOptions(Options):
     """Centre lines, ends and gaps of rows."""
 
-    smoothing: Metres = Field(4.0, description="wavelength below which bends are noise (m)")
+    smoothing: Metres = Field(2.5, description="wavelength below which bends are noise (m)")
     end_share: float = Field(0.5, gt=0, lt=1, description="share of the median cover at which canopy ends")
     min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
 

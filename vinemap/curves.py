@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from vinemap.raster import Raster, sample
-from vinemap.row_frame import between, centre_line, extend, normals, resample, runs_above
+from vinemap.row_frame import between, centre_line, extend, normals, resample, runs_above, whittaker
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,7 +30,9 @@ LONE_WIDTH, LONE_SHARE = 0.85, 0.25
 a hedge or a bush."""
 LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
 """Canopy and width of a row, in those of the parcel's typical row."""
-SMOOTHING = 3.0
+ZIGZAG = 12.0
+"""Wavelength in metres below which the course of the key points is noise."""
+SMOOTHING = 6.0
 """Wavelength in metres below which bends of a course are noise."""
 
 
@@ -152,9 +154,12 @@ def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
     """Course along the middle of the canopy, from where it begins to where it ends."""
     half = min(0.8, 0.42 * spacing)
     curve = resample(extend(ordered, min(2.0, 0.8 * spacing)), STATION)
+    # Key points zigzag; what is added to their course is smooth and would leave the zigzag in.
+    even = np.ones(len(curve))
+    curve = np.column_stack([whittaker(curve[:, k], even, cutoff=ZIGZAG / STATION) for k in (0, 1)])
     for reach in (half, 0.75 * half):
         image, offsets = _straighten(cover, curve, half)
-        shift = centre_line(image, offsets, reach=reach, cutoff=SMOOTHING / STATION)
+        shift = centre_line(image, offsets, np.zeros(len(curve)), reach=reach, cutoff=SMOOTHING / STATION)
         curve = resample(curve + shift[:, None] * normals(curve, smoothing=1 / STATION), STATION)
     image, offsets = _straighten(cover, curve, half)
     profile = image.sum(axis=1) * BIN

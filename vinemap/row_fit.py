@@ -75,7 +75,7 @@ def fit_rows(
     *,
     low: float = 0.5,
     high: float = 2.9,
-    smoothing: float = 4.0,
+    smoothing: float = 2.5,
     end_share: float = 0.5,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -117,17 +117,17 @@ def fit_rows(
         canopy = np.clip((heights - low) / RAMP + 0.5, 0, 1) * np.clip((high - heights) / RAMP + 0.5, 0, 1)
         canopy *= cover.values.ravel()[cell_of(cloud.xyz, cover.grid)] > 0
         points = _Points(cloud.xyz, canopy)
-        for passes in (3, 1):
-            points, shares = _deal(points, curves, half)
-            for k, share in enumerate(shares):
-                shift = np.zeros(len(curves[k]))
-                cutoff = smoothing / CELL * _noise_stretch(share, half[k])
-                for _ in range(passes):
-                    image, offsets = _straighten(share, shift, half[k])
-                    shift = shift + centre_line(image, offsets, reach=0.75 * half[k], cutoff=cutoff)
-                curves[k], shares[k] = _shifted(curves[k], shift), share
-                if passes == 1:
-                    fits.append(_ends(curves[k], _straighten(share, shift, half[k])[0], end_share))
+        points, shares = _deal(points, curves, half)
+        for k, share in enumerate(shares):
+            shift: Values = np.zeros(len(curves[k]))
+            cutoff = smoothing / CELL * _noise_stretch(share, half[k])
+            for _ in range(3):
+                image, offsets = _straighten(share, shift, half[k])
+                shift = centre_line(image, offsets, shift, reach=0.75 * half[k], cutoff=cutoff)
+            curves[k] = _shifted(curves[k], shift)
+        points, shares = _deal(points, curves, half)
+        for curve, share, reach in zip(curves, shares, half, strict=True):
+            fits.append(_ends(curve, _straighten(share, np.zeros(len(curve)), reach)[0], end_share))
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
     for fit, spacing in zip(fits, courses["spacing_m"], strict=True):

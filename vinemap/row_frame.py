@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""
+SLOPE = 1.0
+"""Cutoff of a detail's slopes, in cutoffs of its bends."""
 GUIDE = 0.25
 """Metres between the points of a curve to which cloud points are referred, and the cells of their lookup."""
 
@@ -106,8 +108,8 @@ def between(curve: Values, start: float, end: float) -> Values:
     return at(curve, np.concatenate([[start], way[(way > start) & (way < end)], [end]]))
 
 
-def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:
-    """Offset in metres (n,) of the canopy's centre at each station of a straightened row.
+def centre_line(image: Values, offsets: Values, shift: Values, *, reach: float, cutoff: float) -> Values:
+    """Offset in metres (n,) of the canopy's centre from a curve at each station of a straightened row.
 
     Centroids above a background, within ``reach`` metres of the centre so far, smoothed robustly.
 
@@ -116,7 +118,10 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
     image : (n, m) array
         Canopy cover at n stations and m cells across.
     offsets : (m,) array
-        The cells' metres to the left.
+        The cells' metres to the left of the curve moved by ``shift``.
+    shift : (n,) array
+        Metres by which the image has followed the canopy already. What is smoothed is the whole offset from the
+        curve: smoothing what is left, pass after pass, would smooth less and less.
     reach : float
         Metres to both sides.
     cutoff : float
@@ -125,33 +130,34 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
     smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
     strength = np.quantile(smooth.max(axis=1), 0.7)
     excess = np.maximum(smooth - 0.25 * strength, 0)
-    centre: Values = np.zeros(len(image))
+    centre = shift
     for _ in range(4):
         # A soft edge, so that a cell more or less doesn't move the centroid.
-        soft = np.clip((reach - np.abs(offsets - centre[:, None])) / 0.1 + 0.5, 0, 1)
+        soft = np.clip((reach - np.abs(offsets - (centre - shift)[:, None])) / 0.1 + 0.5, 0, 1)
         near = excess * soft
         weight = near.sum(axis=1)
         # Stations of a stray leaf or two tell nothing of the row's middle.
         typical = np.quantile(weight, 0.7)
         weight = weight * np.clip(2 * weight / max(typical, 1e-9) - 0.5, 0, 1)
-        measured = (near @ offsets) / np.maximum(near.sum(axis=1), 1e-9)
+        measured = shift + (near @ offsets) / np.maximum(near.sum(axis=1), 1e-9)
         robust = np.ones(len(image))
         for _ in range(3):
             trusted = weight * robust
             trend = whittaker(measured, trusted, cutoff=TREND * cutoff)
             # Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
-            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, ridge=0.3)
+            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, slope=SLOPE * cutoff, ridge=0.3)
             residual = np.abs(measured - centre)
             scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
             robust = 1 / (1 + (residual / (2 * scale)) ** 2)
     return centre
 
 
-def whittaker(values: Values, weights: Values, *, cutoff: float, ridge: float = 0.0) -> Values:
-    """Smooth values (n,) by penalised least squares on their second differences (Eilers 2003).
+def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:
+    """Smooth values (n,) by penalised least squares on their second and first differences (Eilers 2003).
 
     ``cutoff`` is the wavelength, in samples, that is halved where weights are 1; where they are 0 the smoothest
-    course is carried over, drawn to zero by ``ridge`` (a share of the mean weight).
+    course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
+    wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
     """
     n = len(values)
     if n < 3:
@@ -164,7 +170,14 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, ridge: float = 
     bands[1, 1:-1] += -2 * penalty
     bands[1, 2:] += -2 * penalty
     bands[0, 2:] += penalty
-    bands[2] += weights + np.where(weights < 0.1 * level, max(ridge, 1e-9), 1e-9) * level
+    first = level * (slope / (2 * np.pi)) ** 2
+    bands[2, :-1] += first
+    bands[2, 1:] += first
+    bands[1, 1:] -= first
+    held = np.flatnonzero(weights >= 0.1 * level)
+    gap = np.ones(n, dtype=bool)
+    gap[held] = gap[: held[0] if len(held) else n] = gap[held[-1] + 1 if len(held) else n :] = False
+    bands[2] += weights + np.where(gap, max(ridge, 1e-9), 1e-9) * level
     out: Values = solveh_banded(bands, weights * values)
     return out
 
