@@ -32,7 +32,7 @@ def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     n = len(rows)
     if n == 0:
         return rows.assign(block=np.empty(0, dtype=np.int64))
-    lines, spacing = rows.geometry.to_numpy(), rows["spacing_m"].to_numpy()
+    lines, spacing = shapely.simplify(rows.geometry.to_numpy(), 0.02), rows["spacing_m"].to_numpy()
     ends = np.array([shapely.get_coordinates(line)[[0, -1]] for line in lines])
     angle = np.arctan2(*(ends[:, 1] - ends[:, 0]).T[::-1])
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=NEIGHBOURS * spacing)

@@ -193,7 +193,7 @@ def _turn(curve: Values) -> float:
 
 def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     """Whether a row lies for the most part within a quarter of a spacing of a longer one."""
-    lines = rows.geometry.to_numpy()
+    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     out = np.zeros(len(rows), dtype=bool)
     order = np.argsort(shapely.length(lines))
     for n, i in enumerate(order):
@@ -219,7 +219,7 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
 
 def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     """Whether another row of about the same direction lies within two spacings of each."""
-    lines = rows.geometry.to_numpy()
+    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     out = np.zeros(len(rows), dtype=bool)
     if len(rows) < 2:
         return out

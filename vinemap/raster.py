@@ -72,9 +72,9 @@ def grid_over(xy: ArrayLike, *, resolution: float) -> Grid:
     InputError
         If it would have more than ``MAX_CELLS`` cells.
     """
-    points = np.asarray(xy)
-    west, south = np.floor(points[:, :2].min(axis=0) / resolution) * resolution
-    east, north = points[:, :2].max(axis=0)
+    x, y = np.asarray(xy)[:, 0], np.asarray(xy)[:, 1]
+    west, south = np.floor(x.min() / resolution) * resolution, np.floor(y.min() / resolution) * resolution
+    east, north = x.max(), y.max()
     nx = int((east - west) // resolution) + 1
     ny = int(np.ceil((north - south) / resolution)) + 1
     if nx * ny > MAX_CELLS:
