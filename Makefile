@@ -35,8 +35,8 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff format --check
 	@$(BIN)/python -m mypy
 
-accuracy: $(READY) ## Measure rows on simulated vineyards: make accuracy [FAMILY="curved fan"]
-	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy
+accuracy: $(READY) ## Measure rows on simulated vineyards, fill README's table: make accuracy [FAMILY="curved fan"]
+	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--readme README.md)
 
 clean: ## Remove .venv and the tools' caches; surveys and products stay
 	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -113,3 +113,11 @@ def test_rows_end_at_a_track_but_not_at_missing_vines():
     points = points[~((points["truth"] == 2) & (x > 10) & (x < 16))].reset_index(drop=True)
     assert_rows_are_kept_apart(cluster_rows(points), 10)
     assert cluster_rows(points, track_width=50)["cluster"].nunique() == 5
+
+
+def test_the_thesis_ellipse_finds_clean_rows_and_stops_at_gaps():
+    rows = [np.array([[0, 2.5 * k], [40, 2.5 * k]]) for k in range(4)]
+    assert_rows_are_kept_apart(cluster_rows(key_points(rows), method="ellipse"), 4)
+    points = key_points(rows)
+    gap = (points["truth"] == 1) & points.geometry.x.between(15, 19)
+    assert cluster_rows(points[~gap].reset_index(drop=True), method="ellipse")["cluster"].nunique() == 5

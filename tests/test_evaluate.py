@@ -4,12 +4,13 @@ import json
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from shapely.geometry import LineString, MultiLineString, Point, Polygon
 
 from vinemap.errors import InputError
-from vinemap.evaluate import evaluate_rows, format_table, match_rows, read_lines
+from vinemap.evaluate import as_layer, evaluate_rows, format_table, match_rows, read_lines
 
 UTM = "EPSG:32632"
 X, Y = 414_700.0, 4_940_700.0
@@ -206,6 +207,17 @@ def test_table_has_a_line_a_pair():
         ["DEK", "0.200", "0.000"],
         ["COF", "0.199", "0.000"],
     ]
+
+
+def test_layer_of_pairs_to_look_at():
+    result = REFERENCE.iloc[1:].copy()
+    stray = gpd.GeoDataFrame(geometry=[LineString([(500, 500), (520, 500)])], crs=REFERENCE.crs)
+    result = gpd.GeoDataFrame(pd.concat([result, stray], ignore_index=True), crs=REFERENCE.crs)
+    layer = as_layer(evaluate_rows(result, REFERENCE), result, REFERENCE.to_crs(4326))
+    assert layer["state"].value_counts().to_dict() == {"matched": len(REFERENCE) - 1, "extra": 1, "missed": 1}
+    assert layer.crs == result.crs
+    assert layer[layer["state"] == "missed"].geometry.iloc[0].equals_exact(REFERENCE.geometry.iloc[0], 1e-5)
+    assert layer[layer["state"] == "matched"]["dep_m"].max() < 1e-6
 
 
 def test_read_lines_finds_the_layer(tmp_path):

@@ -343,12 +343,17 @@ def as_text(lines: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
+MARKS = "<!-- accuracy -->", "<!-- /accuracy -->"
+"""What stands before and after the table in a Markdown file."""
+
+
 @click.command()
 @click.argument("families", nargs=-1, type=click.Choice(list(FAMILIES)), metavar="[FAMILY]...")
 @click.option("--seeds", default=3, show_default=True, type=click.IntRange(1), help="Surveys of each family.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for a picture of each family's worst row.")
 @click.option("--markdown", is_flag=True, help="Print the table as Markdown.")
-def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool) -> None:
+@click.option("--readme", type=click.Path(path_type=Path), help="Markdown file whose table between marks is filled.")
+def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool, readme: Path | None) -> None:
     """Measure the accuracy of the rows on simulated vineyards, of all families unless some are named."""
     names = families or tuple(FAMILIES)
     began = time.perf_counter()
@@ -357,6 +362,11 @@ def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool
         results = {name: job.result() for name, job in jobs.items()}
     lines = table(results)
     click.echo(as_markdown(lines) if markdown else as_text(lines))
+    if readme:
+        before, _, after = (text := readme.read_text(encoding="utf-8")).partition(MARKS[0])
+        if MARKS[0] in text and MARKS[1] in after:
+            after = after.partition(MARKS[1])[2]
+            readme.write_text(f"{before}{MARKS[0]}\n{as_markdown(lines)}\n{MARKS[1]}{after}", encoding="utf-8")
     missed = sum(cell.count("!") for line in lines[1:] for cell in line)
     click.echo(
         f"{missed} values miss their bars (!); surveys: {len(names) * seeds}, in {time.perf_counter() - began:.0f} s",

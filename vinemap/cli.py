@@ -84,11 +84,17 @@ def run(
 @click.argument("reference", type=FILE)
 @click.option("--layer", help="Layer of REFERENCE; rows, or its only layer of lines, by default.")
 @click.option("--parcel", help="Only the lines of REFERENCE in which a column holds this name.")
-def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None) -> None:
+@click.option("--pairs", type=FILE, help="GeoPackage to write: matched, extra and missed rows with their indices.")
+def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None, pairs: Path | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
-    from vinemap.evaluate import evaluate_rows, format_table, read_lines  # noqa: PLC0415
+    from vinemap.evaluate import as_layer, evaluate_rows, format_table, read_lines  # noqa: PLC0415
+    from vinemap.vector import write_layer  # noqa: PLC0415
 
-    click.echo(format_table(evaluate_rows(read_lines(result), read_lines(reference, layer, parcel=parcel))))
+    found, drawn = read_lines(result), read_lines(reference, layer, parcel=parcel)
+    evaluation = evaluate_rows(found, drawn)
+    if pairs:
+        write_layer(as_layer(evaluation, found, drawn), pairs, layer="pairs")
+    click.echo(format_table(evaluation))
 
 
 @contextmanager

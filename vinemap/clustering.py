@@ -34,6 +34,7 @@ OVERLAP = 0.5
 def cluster_rows(
     key_points: gpd.GeoDataFrame,
     *,
+    method: str = "pieces",
     along: float = 1.0,
     across: float = 0.12,
     min_points: int = 6,
@@ -46,9 +47,11 @@ def cluster_rows(
     ----------
     key_points : GeoDataFrame
         Points with ``direction_deg`` and ``spacing_m``.
+    method : str
+        "pieces" as described above; "ellipse" is the thesis's, for comparison: semi-axes of √(3 d) and √(0.5 d)
+        metres (Eq. 4) and nothing joined.
     along, across : float
-        Semi-axes of the elliptic region of interest, in inter-row spacings. The thesis's Eq. 4, in metres
-        √(3 d) and √(0.5 d), has 1.1 and 0.45 at d = 2.5 m.
+        Semi-axes of the elliptic region of interest, in inter-row spacings.
     min_points : int
         Points that a piece of a row has at the least.
     max_gap : float
@@ -64,13 +67,17 @@ def cluster_rows(
     xy = key_points.get_coordinates().to_numpy()
     direction = np.radians(key_points["direction_deg"].to_numpy())
     spacing = key_points["spacing_m"].to_numpy()
-    graph = ellipse_graph(xy, direction, along=along * spacing, across=across * spacing)
+    thesis = method == "ellipse"
+    semi_axes = (np.sqrt(3 * spacing), np.sqrt(0.5 * spacing)) if thesis else (along * spacing, across * spacing)
+    graph = ellipse_graph(xy, direction, along=semi_axes[0], across=semi_axes[1])
     pieces = _components(graph)
     kept = np.bincount(pieces, minlength=1)[pieces] >= min_points
     out = key_points[kept].reset_index(drop=True)
     if len(out) == 0:
         return out.assign(cluster=np.empty(0, dtype=np.int64))
     pieces = np.unique(pieces[kept], return_inverse=True)[1]
+    if thesis:
+        return out.assign(cluster=pieces)
     ends = _ends(xy[kept], direction[kept], spacing[kept], pieces, graph[kept][:, kept])
     pairs = _candidates(ends, max_gap)
     pairs = pairs[~_across_track(ends, pairs, xy[kept], track_width)]

@@ -6,7 +6,7 @@ import difflib
 import re
 import unicodedata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -87,6 +87,7 @@ class KeyPointOptions(Options):
 class ClusteringOptions(Options):
     """Clusters of key points."""
 
+    method: Literal["pieces", "ellipse"] = Field("pieces", description="ours, or the thesis's ellipse alone")
     along: float = Field(1.0, gt=0, le=10, description="semi-axis of the ellipse along the row (spacings)")
     across: float = Field(0.12, gt=0, le=2, description="semi-axis across the row (spacings)")
     min_points: int = Field(6, ge=1, description="key points of a piece")

@@ -203,6 +203,27 @@ def evaluate_rows(
     return Evaluation(pairs, missed_rows, extra_rows, good, extra, missed, *spreads)
 
 
+def as_layer(evaluation: Evaluation, result: gpd.GeoDataFrame, reference: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Lines to look at in QGIS: matched and extra rows of the result, and rows of the reference that it misses.
+
+    Returns
+    -------
+    GeoDataFrame
+        LineString or MultiLineString with ``state`` ("matched", "extra" or "missed"), ``row_id``, ``reference`` and
+        the indices of matched pairs, as in ``evaluation.pairs``.
+    """
+    found, drawn = (
+        dict(zip(ids, frame.to_crs(result.crs).geometry, strict=True))
+        for frame, ids in (_usable(result, "the result"), _usable(reference, "the reference"))
+    )
+    pairs = evaluation.pairs
+    records = [{"state": "matched"} | record for record in pairs.to_dict("records")]
+    records += [{"state": "extra", "row_id": row} for row in evaluation.extra_rows]
+    records += [{"state": "missed", "reference": row} for row in evaluation.missed_rows]
+    lines = [drawn[r["reference"]] if r["state"] == "missed" else found[r["row_id"]] for r in records]
+    return gpd.GeoDataFrame(records, columns=["state", *pairs.columns], geometry=lines, crs=result.crs)
+
+
 def format_table(evaluation: Evaluation) -> str:
     """Lay out an evaluation as plain text: a line a pair, the rows without one, Table 2.2 over all."""
     pairs, missed, extra = evaluation.pairs, evaluation.missed_rows, evaluation.extra_rows

@@ -12,7 +12,7 @@ import pyogrio
 import shapely
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
-from vinemap.errors import InputError
+from vinemap.errors import InputError, OutputError
 from vinemap.style import layer_styles
 
 if TYPE_CHECKING:
@@ -109,6 +109,24 @@ def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
             )
     styles = layer_styles({name: layer.columns for name, layer in LAYERS.items()})
     pyogrio.write_dataframe(styles, path, layer="layer_styles", driver="GPKG", append=True)
+
+
+def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
+    """Write one layer as a GeoPackage of its own, in place of what was there.
+
+    Raises
+    ------
+    OutputError
+        If it can't be written.
+    """
+    draft = path.with_name(f".{path.name}.part.gpkg")
+    try:
+        pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
+        draft.replace(path)
+    except (DataSourceError, DataLayerError, FeatureError, OSError) as error:
+        raise OutputError(f"{path}: can't be written ({' '.join(str(error).split())}): choose another file") from error
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geometry, CRS]:
