@@ -28,6 +28,8 @@ BIN = 0.05
 LONE_WIDTH, LONE_SHARE = 0.85, 0.25
 """Metres of canopy across beyond which, and share of the median length below which, a row with no other beside it is
 a hedge or a bush."""
+BESIDE = 1.3
+"""Spacings within which a row runs beside another."""
 LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
 """Canopy and width of a row, in those of the parcel's typical row."""
 ZIGZAG = 12.0
@@ -218,7 +220,7 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
 
 
 def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
-    """Whether another row of about the same direction lies within two spacings of each."""
+    """Whether another row of about the same direction lies a spacing from each."""
     lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     out = np.zeros(len(rows), dtype=bool)
     if len(rows) < 2:
@@ -226,7 +228,7 @@ def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     chord = np.array([np.diff(shapely.get_coordinates(line)[[0, -1]], axis=0)[0] for line in lines])
     angle = np.arctan2(chord[:, 1], chord[:, 0])
     # Away from the rows their spacing is a guess: it is the parcel's that counts.
-    reach = 2 * np.minimum(rows["spacing_m"], rows["spacing_m"].median()).to_numpy()
+    reach = BESIDE * np.minimum(rows["spacing_m"], rows["spacing_m"].median()).to_numpy()
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=reach)
     parallel = np.abs(np.sin(angle[i] - angle[j])) < np.sin(np.radians(20))
     out[i[parallel & (i != j)]] = True
