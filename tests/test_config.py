@@ -90,11 +90,11 @@ def test_defaults_of_settings_are_those_of_the_stages():
     """A stage called without options works as one called with the default settings."""
     import inspect
 
-    from vinemap import canopy, clustering, curves, ground, key_points, row_field, row_fit, sections
+    from vinemap import canopy, clustering, cover, curves, ground, key_points, row_field, row_fit, sections
 
     stages = {
         "ground": ground.terrain_model,
-        "cover": row_field.canopy_cover,
+        "cover": cover.canopy_cover,
         "row_field": row_field.estimate_row_field,
         "key_points": key_points.detect_key_points,
         "clustering": clustering.cluster_rows,

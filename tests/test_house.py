@@ -17,6 +17,7 @@ BASE = {"errors", "crs"}
 DATA = {"cloud", "raster", "vector", "mesh", "row_frame"}
 STAGES = {
     "ground",
+    "cover",
     "row_field",
     "key_points",
     "clustering",
@@ -42,7 +43,8 @@ MAY_IMPORT = {
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
     "scenes": BASE | {"synthetic"},
     **dict.fromkeys(SETTINGS, BASE),
-    "parcel": CHAIN,
+    "product": CHAIN,
+    "parcel": CHAIN | {"product"},
     "accuracy": CHAIN | {"parcel"},
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
@@ -90,11 +92,11 @@ def test_imports_go_one_way(path):
 @pytest.mark.parametrize(
     ("source", "module", "wrong"),
     [
-        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", []),
+        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", "cover", []),
         ("from vinemap.cloud import PointCloud", "evaluate", []),
         ("from vinemap.key_points import find", "curves", ["key_points"]),
         ("from vinemap import curves, raster", "key_points", ["curves"]),
-        ("import vinemap.parcel", "ground", ["parcel"]),
+        ("import vinemap.parcel", "ground", "cover", ["parcel"]),
         ("from . import cloud", "errors", ["cloud"]),
         ("from .vector import write", "crs", ["vector"]),
         ("if TYPE_CHECKING:\n    from vinemap.row_field import RowField", "mesh", ["row_field"]),

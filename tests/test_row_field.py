@@ -5,10 +5,11 @@ import pytest
 from pyproj import CRS
 
 from vinemap.cloud import PointCloud
+from vinemap.cover import canopy_cover
 from vinemap.crs import parse_crs
 from vinemap.ground import height_above_ground, terrain_model
 from vinemap.raster import Grid, Raster, grid_over
-from vinemap.row_field import canopy_cover, estimate_row_field
+from vinemap.row_field import estimate_row_field
 from vinemap.scenes import hillside, rows_of
 from vinemap.synthetic import Obstacle, Vineyard, simulate
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import time
@@ -10,40 +9,39 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-import geopandas as gpd
 import numpy as np
-import shapely
 
 from vinemap import __version__, paths
-from vinemap.blocks import group_blocks, outline_blocks
+from vinemap.blocks import group_blocks
 from vinemap.canopy import find_feet, measure_sections, section_meshes, separate_canopy, summarise_rows
 from vinemap.cgon import enclose
 from vinemap.cloud import PointCloud, Sections, read_cloud
 from vinemap.clustering import cluster_rows
 from vinemap.confidence import judge_rows
 from vinemap.config import Settings, check_name
-from vinemap.crs import Origin, project, to_main, to_wgs84
+from vinemap.cover import canopy_cover
+from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
 from vinemap.errors import InputError
 from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
 from vinemap.key_points import detect_key_points
-from vinemap.mesh import Mesh, write_glb
 from vinemap.missing import count_missing
-from vinemap.raster import Raster, RowField, write_cog
-from vinemap.row_field import canopy_cover, estimate_row_field, refine_row_field
+from vinemap.product import fingerprint, labelled, parcel_layer, write_product
+from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.sections import cut_sections
-from vinemap.vector import read_boundary, write_geopackage
+from vinemap.vector import read_boundary
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    import geopandas as gpd
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    Boundary = tuple[shapely.Geometry, CRS]
+    from vinemap.raster import Raster, RowField
 
 T = TypeVar("T")
 
@@ -163,7 +161,7 @@ def map_parcel(
     VinemapError
         If the input can't be used or the product can't be written.
     """
-    check_name(parcel)
+    parcel = check_name(parcel)
     settings = settings or Settings()
     began = time.perf_counter()
     seconds: dict[str, float] = {}
@@ -179,7 +177,7 @@ def map_parcel(
         return values
 
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
-    inputs = [_fingerprint(path) for path in (cloud, boundary) if path]
+    inputs = [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
         points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon)
         if origin and np.abs(to_main(points.xyz[:1], points.crs, origin)[0, :2]).max() > FARTHEST:
@@ -202,12 +200,12 @@ def map_parcel(
             "rows": rows,
             "row_ends": ends,
             "key_points": enhanced,
-            "sections": _labelled(table, rows),
-            "gaps": _labelled(gaps, rows),
-            "parcel": _parcel_layer(parcel, rows, polygon, points),
+            "sections": labelled(table, rows),
+            "gaps": labelled(gaps, rows),
+            "parcel": parcel_layer(parcel, rows, polygon, points),
         }
         chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
-        run("Writing", _write, draft, parcel, layers, (found.dtm, chm), found.field, meshes, points)
+        run("Writing", write_product, draft, parcel, layers, (found.dtm, chm), found.field, meshes, points)
         counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         record = {
@@ -245,89 +243,3 @@ def _corner(dtm: Raster) -> Origin:
     south = grid.north - grid.ny * grid.resolution
     lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
     return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
-
-
-def _labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
-    return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
-
-
-def _parcel_layer(
-    parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: PointCloud
-) -> gpd.GeoDataFrame:
-    """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
-    blocks = outline_blocks(rows)
-    if boundary or len(blocks) == 0:
-        polygon = project(*boundary, points.crs) if boundary else _extent(points)
-        totals = [_totals(parcel, rows, polygon, points)]
-        polygons = [polygon]
-    else:
-        polygons = list(blocks.geometry)
-        names = [parcel] if len(blocks) == 1 else [f"{parcel} {block}" for block in blocks["block"]]
-        totals = [
-            _totals(name, rows[rows["block"] == block], polygon, points)
-            for name, block, polygon in zip(names, blocks["block"], polygons, strict=True)
-        ]
-    parts = [[p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"] for polygon in polygons]
-    return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
-
-
-def _extent(points: PointCloud) -> shapely.Geometry:
-    polygon: shapely.Geometry = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
-    return polygon
-
-
-def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: PointCloud) -> dict[str, Any]:
-    angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
-    return {
-        "parcel": name,
-        "n_rows": len(rows),
-        "rows_length_m": rows["length_m"].sum(),
-        "area_m2": float(shapely.area(polygon)),
-        "spacing_m": rows["spacing_m"].median(),
-        "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
-        "gap_m": rows["gap_m"].sum(),
-        "n_missing": rows["n_missing"].sum(),
-        "vine_spacing_m": rows["vine_spacing_m"].median(),
-        "vertical_datum": points.vertical or "",
-    }
-
-
-def _write(
-    folder: Path,
-    parcel: str,
-    layers: dict[str, gpd.GeoDataFrame],
-    surfaces: tuple[Raster, Raster],
-    field: RowField,
-    meshes: list[Mesh],
-    points: PointCloud,
-) -> None:
-    write_geopackage(layers, paths.geopackage(folder, parcel))
-    rasters = {
-        "dtm": (surfaces[0], "Terrain elevation", "m"),
-        "chm": (surfaces[1], "Height above terrain", "m"),
-        "row_direction": (field.direction, "Row direction, anticlockwise from east", "degree"),
-        "row_spacing": (field.spacing, "Inter-row spacing", "m"),
-        "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
-    }
-    for kind, (raster, description, unit) in rasters.items():
-        resampling = "nearest" if unit == "degree" else "average"
-        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit, resampling=resampling)
-    centre = points.xyz.mean(axis=0)
-    write_glb(
-        meshes,
-        paths.canopy_mesh(folder, parcel),
-        origin=tuple(np.round(centre).tolist()),
-        crs=points.crs.to_string(),
-        extras={"vertical": points.vertical},
-    )
-
-
-def _fingerprint(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror})") from error
-    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}

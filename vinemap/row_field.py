@@ -14,22 +14,16 @@ import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.fft import rfft2
 from scipy.ndimage import (
-    binary_dilation,
-    binary_opening,
-    gaussian_filter,
     map_coordinates,
     maximum_filter,
-    uniform_filter,
 )
 from scipy.spatial import cKDTree
 
-from vinemap.raster import Grid, Raster, RowField, cell_of, coarser, count, grid_over
+from vinemap.raster import Grid, Raster, RowField, coarser
 
 if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
-
-    from vinemap.cloud import PointCloud
 
     Values = NDArray[np.floating]
 
@@ -37,10 +31,6 @@ FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
 COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
-TALLEST = 40.0
-"""Metres above which nothing stands: points there are birds and noise."""
-WIDEST = 2.0
-"""Metres across which no canopy of a row is closed."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = (1, 2, 3)
@@ -54,77 +44,6 @@ class _Peaks(NamedTuple):
     direction: Values
     spacing: Values
     strength: Values
-
-
-def canopy_cover(
-    cloud: PointCloud,
-    heights: Values,
-    *,
-    resolution: float = 0.1,
-    low: float = 0.5,
-    high: float = 2.9,
-    smoothing: float | None = None,
-) -> Raster:
-    """Share of a cell's points that are canopy: between two heights above ground, and under nothing taller.
-
-    A ratio, so that neither the cloud's density nor its unevenness between flight lines matters.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-        The parcel's points.
-    heights : (n,) array
-        Their heights above ground in metres.
-    resolution : float
-        Cell size in metres.
-    smoothing : float, optional
-        Standard deviation in metres of the Gaussian that smooths both counts; by default the cloud's mean distance
-        between points, and half a cell at the least.
-    low, high : float
-        Heights in metres between which points count as canopy. What is taller (trees, houses) or wider than a row
-        of vines (huts, hedges, bushes) is left out.
-    """
-    grid = grid_over(cloud.xyz, resolution=resolution)
-    cells = cell_of(cloud.xyz, grid)
-    everything = count(cells, grid)
-    canopy = count(cells[(heights >= low) & (heights <= high)], grid)
-    density = len(cells) / max(1, int(np.count_nonzero(everything)))
-    sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
-    blurred = gaussian_filter(everything, sigma)
-    cover = gaussian_filter(canopy, sigma) / (blurred + 0.1 * density)
-    tall = count(cells[(heights > high) & (heights < TALLEST)], grid)
-    cover[_no_vines(everything, canopy, tall, resolution)] = 0.0
-    return Raster(cover, grid, cloud.crs)
-
-
-def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: float) -> NDArray[np.bool_]:
-    """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them.
-
-    Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
-    """
-    k = max(1, round(COVER_RESOLUTION / resolution))
-    cell = k * resolution
-    # Summed over 3 x 3 blocks, so that a sparse cloud is judged by more than a point or two.
-    all_, mass, above = (9 * uniform_filter(_blocks(v, k), 3) for v in (everything, canopy + tall, tall))
-    high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
-    wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), _disc(WIDEST / 2, cell))
-    out: NDArray[np.bool_] = binary_dilation(high | wide, _disc(0.5, cell))
-    return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
-
-
-def _disc(radius: float, cell: float) -> NDArray[np.bool_]:
-    """Cells whose centre lies within a radius of the middle one's."""
-    n = int(radius / cell)
-    out: NDArray[np.bool_] = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell <= radius
-    return out
-
-
-def _blocks(values: Values, k: int) -> Values:
-    """Sums over blocks of k x k cells."""
-    ny, nx = (-(-n // k) for n in values.shape)
-    padding = [(0, ny * k - values.shape[0]), (0, nx * k - values.shape[1])]
-    out: Values = np.pad(values, padding).reshape(ny, k, nx, k).sum(axis=(1, 3))
-    return out
 
 
 def estimate_row_field(

@@ -1,0 +1,128 @@
+"""What a parcel's run leaves: layers, rasters, meshes, and what is known of its inputs."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING, Any
+
+import geopandas as gpd
+import numpy as np
+import shapely
+
+from vinemap import paths
+from vinemap.blocks import outline_blocks
+from vinemap.crs import project
+from vinemap.errors import InputError
+from vinemap.mesh import Mesh, write_glb
+from vinemap.raster import Raster, RowField, write_cog
+from vinemap.vector import write_geopackage
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pyproj import CRS
+
+    from vinemap.cloud import PointCloud
+
+    Boundary = tuple[shapely.Geometry, CRS]
+
+
+def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Give what belongs to rows, by ``row_id``, their ``label``."""
+    return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
+
+
+def parcel_layer(
+    parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: PointCloud
+) -> gpd.GeoDataFrame:
+    """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
+    blocks = outline_blocks(rows)
+    if boundary or len(blocks) == 0:
+        polygon = project(*boundary, points.crs) if boundary else _extent(points)
+        totals = [_totals(parcel, rows, polygon, points)]
+        polygons = [polygon]
+    else:
+        polygons = list(blocks.geometry)
+        names = [parcel] if len(blocks) == 1 else [f"{parcel} {block}" for block in blocks["block"]]
+        totals = [
+            _totals(name, rows[rows["block"] == block], polygon, points)
+            for name, block, polygon in zip(names, blocks["block"], polygons, strict=True)
+        ]
+    parts = [[p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"] for polygon in polygons]
+    return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
+
+
+def _extent(points: PointCloud) -> shapely.Geometry:
+    polygon: shapely.Geometry = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
+    return polygon
+
+
+def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: PointCloud) -> dict[str, Any]:
+    angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
+    return {
+        "parcel": name,
+        "n_rows": len(rows),
+        "rows_length_m": rows["length_m"].sum(),
+        "area_m2": float(shapely.area(polygon)),
+        "spacing_m": rows["spacing_m"].median(),
+        "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
+        "gap_m": rows["gap_m"].sum(),
+        "n_missing": rows["n_missing"].sum(),
+        "vine_spacing_m": rows["vine_spacing_m"].median(),
+        "vertical_datum": points.vertical or "",
+    }
+
+
+def write_product(
+    folder: Path,
+    parcel: str,
+    layers: dict[str, gpd.GeoDataFrame],
+    surfaces: tuple[Raster, Raster],
+    field: RowField,
+    meshes: list[Mesh],
+    points: PointCloud,
+) -> None:
+    """Write all files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
+
+    Raises
+    ------
+    OSError
+        If one can't be written.
+    """
+    write_geopackage(layers, paths.geopackage(folder, parcel))
+    rasters = {
+        "dtm": (surfaces[0], "Terrain elevation", "m"),
+        "chm": (surfaces[1], "Height above terrain", "m"),
+        "row_direction": (field.direction, "Row direction, anticlockwise from east", "degree"),
+        "row_spacing": (field.spacing, "Inter-row spacing", "m"),
+        "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
+    }
+    for kind, (raster, description, unit) in rasters.items():
+        resampling = "nearest" if unit == "degree" else "average"
+        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit, resampling=resampling)
+    centre = points.xyz.mean(axis=0)
+    write_glb(
+        meshes,
+        paths.canopy_mesh(folder, parcel),
+        origin=tuple(np.round(centre).tolist()),
+        crs=points.crs.to_string(),
+        extras={"vertical": points.vertical},
+    )
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Name, size and SHA-256 of an input.
+
+    Raises
+    ------
+    InputError
+        If it can't be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror})") from error
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}
