@@ -4,7 +4,6 @@ import json
 
 import geopandas as gpd
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 from shapely.geometry import LineString, MultiLineString, Point, Polygon
@@ -210,14 +209,19 @@ def test_table_has_a_line_a_pair():
 
 
 def test_layer_of_pairs_to_look_at():
-    result = REFERENCE.iloc[1:].copy()
-    stray = gpd.GeoDataFrame(geometry=[LineString([(500, 500), (520, 500)])], crs=REFERENCE.crs)
-    result = gpd.GeoDataFrame(pd.concat([result, stray], ignore_index=True), crs=REFERENCE.crs)
-    layer = as_layer(evaluate_rows(result, REFERENCE), result, REFERENCE.to_crs(4326))
-    assert layer["state"].value_counts().to_dict() == {"matched": len(REFERENCE) - 1, "extra": 1, "missed": 1}
+    lines = [LineString([(500_000, 4_940_000 + y), (500_040, 4_940_000 + y)]) for y in (0, 2.5, 5, 60)]
+    reference = gpd.GeoDataFrame({"row": [1, 2, 3]}, geometry=lines[:3], crs=32632)
+    result = gpd.GeoDataFrame({"row_id": [7, 8, 9]}, geometry=[lines[1], lines[2], lines[3]], crs=32632)
+    layer = as_layer(evaluate_rows(result, reference), result, reference.to_crs(4326))
+    assert list(zip(layer["state"], layer["reference"], layer["row_id"].fillna(0), strict=True)) == [
+        ("matched", 2, 7),
+        ("matched", 3, 8),
+        ("extra", pytest.approx(np.nan, nan_ok=True), 9),
+        ("missed", 1, 0),
+    ]
     assert layer.crs == result.crs
-    assert layer[layer["state"] == "missed"].geometry.iloc[0].equals_exact(REFERENCE.geometry.iloc[0], 1e-5)
-    assert layer[layer["state"] == "matched"]["dep_m"].max() < 1e-6
+    assert layer.geometry.iloc[3].equals_exact(lines[0], 1e-5)
+    assert layer["dep_m"].iloc[:2].max() < 1e-6
 
 
 def test_read_lines_finds_the_layer(tmp_path):

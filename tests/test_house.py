@@ -92,11 +92,11 @@ def test_imports_go_one_way(path):
 @pytest.mark.parametrize(
     ("source", "module", "wrong"),
     [
-        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", "cover", []),
+        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", []),
         ("from vinemap.cloud import PointCloud", "evaluate", []),
         ("from vinemap.key_points import find", "curves", ["key_points"]),
         ("from vinemap import curves, raster", "key_points", ["curves"]),
-        ("import vinemap.parcel", "ground", "cover", ["parcel"]),
+        ("import vinemap.parcel", "ground", ["parcel"]),
         ("from . import cloud", "errors", ["cloud"]),
         ("from .vector import write", "crs", ["vector"]),
         ("if TYPE_CHECKING:\n    from vinemap.row_field import RowField", "mesh", ["row_field"]),
