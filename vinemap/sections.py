@@ -57,15 +57,15 @@ def cut_sections(
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]
     near = row_coordinates(cloud.xyz, curves, 0.5 * rows["spacing_m"].to_numpy())
-    order = np.lexsort((near.along, near.row))
-    left, member = near.left[order], near.member[order]
+    # Rows are laid one behind the other so that one sort, and one search, finds the points of every section.
+    stride = max(line.length for line in lines) + 10 * width + 10
+    key = near.row * stride + near.along
+    order = np.argsort(key)
+    key, left, member = key[order], near.left[order], near.member[order]
 
     parts = [_stations(line, gaps[gaps["row_id"] == i], step) for line, i in zip(lines, rows["row_id"], strict=True)]
     station_row = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts)])
     position = np.concatenate(parts)
-    # Rows are laid one behind the other so that one search finds the points of every section.
-    stride = max(line.length for line in lines) + 10 * width + 10
-    key = near.row[order] * stride + near.along[order]
     low = np.searchsorted(key, station_row * stride + position - width / 2, side="left")
     high = np.searchsorted(key, station_row * stride + position + width / 2, side="right")
     start = np.concatenate([[0], np.cumsum(high - low)])
