@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     Values = NDArray[np.floating]
 
 BATCH = 20_000
-SLICES = 5
+SLICES = 3
 """Lines across the rows that are averaged in a slice."""
 
 

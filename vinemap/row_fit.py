@@ -58,9 +58,9 @@ class _Points(NamedTuple):
 
 
 class _Share(NamedTuple):
-    """Points of one row: their station (in ``CELL`` along it, n of them), metres to its left, and canopy 0 to 1."""
+    """Points of one row: their station of n along it, metres to its left, and canopy 0 to 1."""
 
-    station: Values
+    station: NDArray[np.int64]
     left: Values
     canopy: Values
     n: int
@@ -148,13 +148,15 @@ def fit_rows(
 def _deal(points: _Points, curves: Sequence[Values], half: Values) -> tuple[_Points, list[_Share]]:
     """Points near the curves, and each curve's share of them in its own frame."""
     near = row_coordinates(points.xyz, curves, half + REACH)
-    order = np.argsort(near.row, kind="stable")
+    order = np.argsort(near.row.astype(np.int16), kind="stable")  # sixteen bits are sorted by radix
     first = np.searchsorted(near.row[order], np.arange(len(curves) + 1))
     shares = []
     for k, curve in enumerate(curves):
         mine = order[first[k] : first[k + 1]]
-        station = near.along[mine] / way_along(curve)[-1] * (len(curve) - 1)
-        shares.append(_Share(station, near.left[mine], points.canopy[near.member[mine]], len(curve)))
+        station = np.rint(near.along[mine] / way_along(curve)[-1] * (len(curve) - 1)).astype(np.int64)
+        inside = (station >= 0) & (station < len(curve))
+        mine = mine[inside]
+        shares.append(_Share(station[inside], near.left[mine], points.canopy[near.member[mine]], len(curve)))
     return _Points(points.xyz[near.member], points.canopy[near.member]), shares
 
 
@@ -167,10 +169,10 @@ def _noise_stretch(share: _Share, half: float) -> float:
 def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
     m = int(np.ceil(half / CELL))
-    left = (share.left - np.interp(share.station, np.arange(share.n), shift)) / CELL + m
-    inside = (share.station > -0.5) & (share.station < share.n - 0.5) & (left > -0.5) & (left < 2 * m + 0.5)
+    column = np.rint((share.left - shift[share.station]) / CELL).astype(np.int64) + m
+    inside = (column >= 0) & (column <= 2 * m)
     shape = (share.n, 2 * m + 1)
-    cell = np.rint(share.station[inside]).astype(np.int64) * shape[1] + np.rint(left[inside]).astype(np.int64)
+    cell = share.station[inside] * shape[1] + column[inside]
     everything = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
     leaves = np.bincount(cell, weights=share.canopy[inside], minlength=shape[0] * shape[1]).reshape(shape)
     density = max(float(everything.mean()), 1e-9)
