@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def as_tasks(show: Callable[..., Any]) -> Callable[..., Any]:
     """Give a ``step`` that runs each stage as a Prefect task; arrays are neither cached nor stored."""
 
-    def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+    def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         # Without parameters, as Prefect would walk through every array that it is given.
         stage = task(name=name, cache_policy=NO_CACHE, persist_result=False)(lambda: function(*args, **kwargs))
         return show(name, stage)

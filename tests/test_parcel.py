@@ -20,6 +20,8 @@ from vinemap.scenes import hillside, rows_of
 from vinemap.synthetic import Obstacle, Vineyard, simulate, write_survey
 from vinemap.vector import LAYERS
 
+RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
+
 
 @pytest.fixture(scope="module")
 def survey(vineyard, tmp_path_factory):
@@ -64,7 +66,7 @@ def test_missing_vines_are_gaps(product, vineyard):
 def test_product_is_the_contracts(product):
     folder = product.folder
     record = json.loads((folder / "run.json").read_text())
-    expected = {"A.gpkg", "A_canopy.glb", *(f"A_{kind}.tif" for kind in paths.RASTERS)}
+    expected = {"A.gpkg", "A_canopy.glb", *(f"A_{kind}.tif" for kind in RASTERS)}
     assert {p.name for p in folder.iterdir()} == expected | {"run.json"}
     assert set(record["files"]) == expected
     assert record["origin"] == {"lat": 44.6, "lon": 7.9, "alt": 250.0}
@@ -96,7 +98,7 @@ def test_table_2_1_holds_together(product):
 
 
 def test_rasters(product):
-    for kind in paths.RASTERS:
+    for kind in RASTERS:
         with rasterio.open(paths.raster(product.folder, "A", kind)) as src:
             assert src.crs.to_epsg() == 32632
             assert src.nodata == -9999
@@ -141,7 +143,7 @@ def test_nothing_is_a_product_of_empty_layers(tmp_path):
         frame = gpd.read_file(paths.geopackage(tmp_path / "out", "meadow"), layer=layer)
         assert [c for c in frame.columns if c != "geometry"] == list(contract.columns)
         assert len(frame) == (1 if layer == "parcel" else 0)
-    for kind in paths.RASTERS:
+    for kind in RASTERS:
         assert paths.raster(tmp_path / "out", "meadow", kind).is_file()
     assert len(pygltflib.GLTF2().load(paths.canopy_mesh(tmp_path / "out", "meadow")).nodes) == 1
 

@@ -248,7 +248,7 @@ def measure(name: str, seeds: int, out: Path | None = None) -> Errors:
 
 def draw(worst: Worst | None, survey: Survey, found: RowMap, title: str, path: Path) -> None:
     """Draw a map, and its worst row straightened and at both ends, over the canopy cover."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - a tool of development
+    from matplotlib.figure import Figure  # a tool of development
 
     figure = Figure(figsize=(16, 10 if worst else 8), layout="constrained")
     if worst is None:

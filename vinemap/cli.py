@@ -23,8 +23,8 @@ FILE = click.Path(path_type=Path)
 class _Origin(click.ParamType):  # type: ignore[type-arg]
     name = "LAT,LON,ALT"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        from vinemap.crs import Origin, check_origin  # noqa: PLC0415
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from vinemap.crs import Origin, check_origin
 
         try:
             lat, lon, alt = (float(part) for part in str(value).split(","))
@@ -55,13 +55,13 @@ def run(
     crs: str | None,
     parcel: str | None,
     out: Path | None,
-    origin: Any,  # noqa: ANN401
+    origin: Any,
     settings: Path | None,
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
-    from vinemap import paths  # noqa: PLC0415
-    from vinemap.config import check_name, load_settings  # noqa: PLC0415
-    from vinemap.crs import parse_crs  # noqa: PLC0415
+    from vinemap import paths
+    from vinemap.config import check_name, load_settings
+    from vinemap.crs import parse_crs
 
     name = check_name(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
@@ -73,7 +73,7 @@ def run(
         "named": parcel is not None,
     }
     with progress(name) as step:
-        from vinemap.parcel import map_parcel  # noqa: PLC0415
+        from vinemap.parcel import map_parcel
 
         summary = map_parcel(cloud, folder, parcel=name, step=step, **options)
     click.echo(summary.line())
@@ -87,8 +87,8 @@ def run(
 @click.option("--pairs", type=FILE, help="GeoPackage to write: matched, extra and missed rows with their indices.")
 def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None, pairs: Path | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
-    from vinemap.evaluate import as_layer, evaluate_rows, format_table, read_lines  # noqa: PLC0415
-    from vinemap.vector import write_layer  # noqa: PLC0415
+    from vinemap.evaluate import as_layer, evaluate_rows, format_table, read_lines
+    from vinemap.vector import write_layer
 
     found, drawn = read_lines(result), read_lines(reference, layer, parcel=parcel)
     evaluation = evaluate_rows(found, drawn)
@@ -100,16 +100,16 @@ def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | Non
 @contextmanager
 def progress(parcel: str) -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr."""
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("Starting", total=None, parcel=parcel)
 
-        def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-            from vinemap.parcel import STAGES  # noqa: PLC0415
+        def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            from vinemap.parcel import STAGES
 
             bar.update(task, description=name, total=len(STAGES), completed=STAGES.index(name))
             return function(*args, **kwargs)

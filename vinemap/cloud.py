@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -32,14 +32,13 @@ Boundary = tuple["shapely.Geometry", "CRS"]
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points (n, 3) in metres, x east, y north, z up, with per-point fields under LAS dimension names.
+    """Points (n, 3) in metres, x east, y north, z up.
 
     ``vertical`` names the vertical datum that the file states; heights are never moved to another.
     """
 
     xyz: NDArray[np.float64]
     crs: CRS
-    fields: dict[str, NDArray[Any]] = field(default_factory=dict)
     vertical: str | None = None
 
 
@@ -110,7 +109,7 @@ def read_cloud(
     InputError
         If the file can't be read whole, has no points, no CRS, or coordinates that can't be right.
     """
-    import laspy  # noqa: PLC0415  (0.4 s of start-up)
+    import laspy  # 0.4 s of start-up
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -127,13 +126,13 @@ def read_cloud(
         raise InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?") from error
 
 
-def _backends(path: Path) -> Any:  # noqa: ANN401
-    import laspy  # noqa: PLC0415
+def _backends(path: Path) -> Any:
+    import laspy
 
     return None if path.suffix.lower() == ".las" else [laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs]
 
 
-def _stated_crs(header: Any, path: Path) -> CRS:  # noqa: ANN401
+def _stated_crs(header: Any, path: Path) -> CRS:
     try:
         stated: CRS | None = header.parse_crs()
     except Exception as error:
@@ -146,7 +145,7 @@ def _stated_crs(header: Any, path: Path) -> CRS:  # noqa: ANN401
     return check_horizontal(stated)
 
 
-def _check_header(header: Any, crs: CRS, path: Path) -> None:  # noqa: ANN401
+def _check_header(header: Any, crs: CRS, path: Path) -> None:
     if header.point_count == 0:
         raise InputError(f"{path}: holds no points")
     numbers = np.concatenate([header.scales, header.offsets])
@@ -162,7 +161,7 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:  # noqa: ANN401
 
 
 def _read(
-    reader: Any,  # noqa: ANN401
+    reader: Any,
     source: CRS,
     boundary: Boundary | None,
     path: Path,
@@ -209,7 +208,7 @@ def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np
 
 
 def _clipper(boundary: Boundary, target: CRS, path: Path) -> Callable[[NDArray[np.float64]], NDArray[np.bool_]]:
-    import shapely  # noqa: PLC0415
+    import shapely
 
     polygon = project(*boundary, target)
     bounds = shapely.bounds(polygon)

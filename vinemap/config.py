@@ -243,7 +243,7 @@ def load_settings(path: Path) -> Settings:
     )
 
 
-def _read_yaml(path: Path) -> Any:  # noqa: ANN401
+def _read_yaml(path: Path) -> Any:
     if not path.is_file():
         folder = path.parent if path.parent.is_dir() else Path()
         known = [str(p) for p in sorted(folder.glob("*.yaml"))]
@@ -255,7 +255,7 @@ def _read_yaml(path: Path) -> Any:  # noqa: ANN401
         raise ConfigError(f"{path}: no valid YAML ({reason})") from error
 
 
-def _validated(model: type[M], data: Any, path: Path) -> M:  # noqa: ANN401
+def _validated(model: type[M], data: Any, path: Path) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.raster import Raster, cell_of, count, grid_over
+from vinemap.raster import Raster, block_sum, cell_of, count, grid_over
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,7 +73,7 @@ def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: floa
     k = max(1, round(BLOCK / resolution))
     cell = k * resolution
     # Summed over 3 x 3 blocks, so that a sparse cloud is judged by more than a point or two.
-    all_, mass, above = (9 * uniform_filter(_blocks(v, k), 3) for v in (everything, canopy + tall, tall))
+    all_, mass, above = (9 * uniform_filter(block_sum(v, k), 3) for v in (everything, canopy + tall, tall))
     high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
     wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), _disc(WIDEST / 2, cell))
     out: NDArray[np.bool_] = binary_dilation(high | wide, _disc(0.5, cell))
@@ -84,12 +84,4 @@ def _disc(radius: float, cell: float) -> NDArray[np.bool_]:
     """Cells whose centre lies within a radius of the middle one's."""
     n = int(radius / cell)
     out: NDArray[np.bool_] = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell <= radius
-    return out
-
-
-def _blocks(values: Values, k: int) -> Values:
-    """Sums over blocks of k x k cells."""
-    ny, nx = (-(-n // k) for n in values.shape)
-    padding = [(0, ny * k - values.shape[0]), (0, nx * k - values.shape[1])]
-    out: Values = np.pad(values, padding).reshape(ny, k, nx, k).sum(axis=(1, 3))
     return out

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 
 from vinemap.raster import Raster, sample
-from vinemap.row_frame import between, centre_line, extend, normals, resample, runs_above, whittaker
+from vinemap.row_frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -154,7 +154,7 @@ def _scan(xy: Values, direction: Values, start: int, heading: Values, threshold:
 
 def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
     """Course along the middle of the canopy, from where it begins to where it ends."""
-    half = min(0.8, 0.42 * spacing)
+    half = float(half_width(spacing))
     curve = resample(extend(ordered, min(2.0, 0.8 * spacing)), STATION)
     # Key points zigzag; what is added to their course is smooth and would leave the zigzag in.
     even = np.ones(len(curve))

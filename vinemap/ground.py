@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
-from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample
+from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, sample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -239,15 +239,8 @@ def _decimated_fit(level: Values, weight: Values, sigma: float) -> Values:
     k = int(sigma / NARROWEST)
     if k < 2:
         return _plane_fit(level, weight, sigma)
-    ny, nx = (-(-n // k) for n in level.shape)
-    padding = [(0, ny * k - level.shape[0]), (0, nx * k - level.shape[1])]
-
-    def blocks(values: Values) -> Values:
-        out: Values = np.pad(values, padding).reshape(ny, k, nx, k).mean(axis=(1, 3))
-        return out
-
-    mean_weight = blocks(weight)
-    mean_level = blocks(weight * level) / np.maximum(mean_weight, 1e-9)
+    mean_weight = block_sum(weight, k) / k**2
+    mean_level = block_sum(weight * level, k) / k**2 / np.maximum(mean_weight, 1e-9)
     wide = _plane_fit(mean_level, mean_weight, sigma / k)
     i, j = ((np.arange(n) + 0.5) / k - 0.5 for n in level.shape)
     for axis, at in ((0, i), (1, j)):

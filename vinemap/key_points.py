@@ -8,7 +8,7 @@ import geopandas as gpd
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from vinemap.raster import sample
+from vinemap.raster import cell_of, sample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,11 +96,11 @@ def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> V
     x = np.arange(grid.west + step / 2, grid.west + grid.nx * grid.resolution, step)
     y = np.arange(grid.north - step / 2, grid.north - grid.ny * grid.resolution, -step)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    cells = field.direction.grid
-    i = np.clip(((cells.north - xy[:, 1]) / cells.resolution).astype(int), 0, cells.ny - 1)
-    j = np.clip(((xy[:, 0] - cells.west) / cells.resolution).astype(int), 0, cells.nx - 1)
-    direction, spacing = field.direction.values[i, j], field.spacing.values[i, j]
-    likely = (field.likelihood.values[i, j] >= min_likelihood) & np.isfinite(direction) & np.isfinite(spacing)
+    cell = cell_of(xy, field.direction.grid)
+    direction, spacing, likelihood = (
+        r.values.ravel()[cell] for r in (field.direction, field.spacing, field.likelihood)
+    )
+    likely = (likelihood >= min_likelihood) & np.isfinite(direction) & np.isfinite(spacing)
     nodes: Values = np.column_stack([xy, np.radians(direction), spacing])[likely]
     return nodes
 

@@ -165,7 +165,7 @@ def write_glb(
     extras : mapping, optional
         More for the root node: vertical datum ("vertical"), parcel, survey.
     """
-    import pygltflib as gltf  # noqa: PLC0415  (100 ms, for one function)
+    import pygltflib as gltf  # 100 ms, for one function
 
     zero = np.asarray(origin, dtype=np.float64)
     placed = {"crs": crs, **(extras or {}), "origin": zero}
@@ -245,7 +245,7 @@ def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:
     return struct.pack("<I4s", len(data), kind) + data
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401  (any JSON)
+def _plain(value: Any) -> Any:  # any JSON
     """A value as JSON has it: numpy's numbers as Python's, what isn't finite as null (dropped from a mapping)."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
@@ -267,7 +267,7 @@ def audit(mesh: Mesh) -> Audit:
         If Open3D can't be loaded.
     """
     try:
-        import open3d  # noqa: PLC0415  (1 s, 400 MB, and needs system libraries)
+        import open3d  # 1 s, 400 MB, and needs system libraries
     except (ImportError, OSError) as error:
         raise DependencyError(
             f"Open3D can't be loaded ({error}): apt-get install libegl1 libgl1 libusb-1.0-0, or pip install open3d-cpu"

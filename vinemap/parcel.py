@@ -81,7 +81,7 @@ class Summary(NamedTuple):
         return f"{self.parcel}: {found}, in {self.seconds:.1f} s → {self.folder}"
 
 
-def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:  # noqa: ANN401
+def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
     """Run a stage as it is."""
     del name
     return function(*args, **kwargs)
@@ -102,22 +102,18 @@ class RowMap(NamedTuple):
 
 def map_rows(points: PointCloud, settings: Settings, *, step: Callable[..., Any] = call) -> RowMap:
     """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2)."""
-
-    def options(stage: str) -> dict[str, Any]:
-        values: dict[str, Any] = getattr(settings, stage).model_dump()
-        return values
-
-    dtm = step("DTM", terrain_model, points, **options("ground"))
+    options = settings.model_dump()
+    dtm = step("DTM", terrain_model, points, **options["ground"])
     heights = height_above_ground(points, dtm)
-    cover = step("Canopy cover", canopy_cover, points, heights, **options("cover"))
-    field = step("Row field", estimate_row_field, cover, **options("row_field"))
-    key_points = step("Key points", detect_key_points, cover, dtm, field, **options("key_points"))
-    clusters = step("Clusters", cluster_rows, key_points, **options("clustering"))
-    courses = step("Curves", trace_rows, clusters, cover, **options("curves"))
+    cover = step("Canopy cover", canopy_cover, points, heights, **options["cover"])
+    field = step("Row field", estimate_row_field, cover, **options["row_field"])
+    key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
+    clusters = step("Clusters", cluster_rows, key_points, **options["clustering"])
+    courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     limits = {"low": settings.cover.low, "high": settings.cover.high}
-    fitted = step("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options("fit"))
+    fitted = step("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options["fit"])
     rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
-    rows, gaps = count_missing(judge_rows(rows), gaps, **options("missing"))
+    rows, gaps = count_missing(judge_rows(rows), gaps, **options["missing"])
     return RowMap(dtm, heights, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 
@@ -166,16 +162,13 @@ def map_parcel(
     began = time.perf_counter()
     seconds: dict[str, float] = {}
 
-    def run(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:  # noqa: ANN401
+    def run(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
         start = time.perf_counter()
         out: T = step(name, function, *args, **kwargs)
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
-    def options(stage: str) -> dict[str, Any]:
-        values: dict[str, Any] = getattr(settings, stage).model_dump()
-        return values
-
+    options = settings.model_dump()
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
@@ -186,7 +179,7 @@ def map_parcel(
             )
         found = map_rows(points, settings, step=run)
         heights, rows, gaps = found.heights, found.rows, found.gaps
-        sections = run("Sections", cut_sections, points, heights, rows, gaps, found.dtm, **options("sections"))
+        sections = run("Sections", cut_sections, points, heights, rows, gaps, found.dtm, **options["sections"])
         canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
         origin = origin or _corner(found.dtm)
         rows, ends, enhanced = describe_rows(
@@ -230,8 +223,9 @@ def _model_canopy(
     sections: Sections, settings: Settings, crs: CRS
 ) -> tuple[Sections, NDArray[np.float64], gpd.GeoDataFrame]:
     """Canopy points of every section, their c-gons (m, c, 2), and the table of sections."""
-    canopy, feet = find_feet(separate_canopy(sections, **settings.canopy.model_dump()))
-    enclosed = enclose(canopy.points, canopy.start, feet, **settings.polygon.model_dump())
+    options = settings.model_dump()
+    canopy, feet = find_feet(separate_canopy(sections, **options["canopy"]))
+    enclosed = enclose(canopy.points, canopy.start, feet, **options["polygon"])
     canopy = canopy.subset(enclosed.kept, enclosed.valid)
     polygons = enclosed.polygon[enclosed.valid]
     return canopy, polygons, measure_sections(canopy, polygons, enclosed.area[enclosed.valid], crs=crs)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 DATA = Path("data")
-RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 RUN = "run.json"
 
 
@@ -46,7 +45,7 @@ def geopackage(folder: Path, parcel: str) -> Path:
 
 
 def raster(folder: Path, parcel: str, kind: str) -> Path:
-    """One of the rasters of a product (``RASTERS``)."""
+    """One of the rasters of a product."""
     return folder / f"{parcel}_{kind}.tif"
 
 

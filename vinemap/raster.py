@@ -107,6 +107,14 @@ def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
     return np.bincount(cells, minlength=grid.ny * grid.nx).reshape(grid.shape).astype(float)
 
 
+def block_sum(values: NDArray[np.floating], k: int) -> NDArray[np.floating]:
+    """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)); beyond the edge there is nothing."""
+    ny, nx = (-(-n // k) for n in values.shape)
+    padding = [(0, ny * k - values.shape[0]), (0, nx * k - values.shape[1])]
+    out: NDArray[np.floating] = np.pad(values, padding).reshape(ny, k, nx, k).sum(axis=(1, 3))
+    return out
+
+
 def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
     points = np.asarray(xy, dtype=float)
@@ -129,9 +137,9 @@ def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resamp
     OSError
         If it can't be written.
     """
-    import rasterio  # noqa: PLC0415  (half a second of start-up, needed only here)
-    from rasterio.io import MemoryFile  # noqa: PLC0415
-    from rasterio.shutil import copy  # noqa: PLC0415
+    import rasterio  # half a second of start-up, needed only here
+    from rasterio.io import MemoryFile
+    from rasterio.shutil import copy
 
     grid = raster.grid
     values = np.where(np.isfinite(raster.values), raster.values, NODATA).astype(np.float32)

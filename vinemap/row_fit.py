@@ -15,7 +15,17 @@ import shapely
 from scipy.ndimage import gaussian_filter
 
 from vinemap.raster import Raster, cell_of, sample
-from vinemap.row_frame import between, centre_line, extend, normals, resample, row_coordinates, runs_above, way_along
+from vinemap.row_frame import (
+    between,
+    centre_line,
+    extend,
+    half_width,
+    normals,
+    resample,
+    row_coordinates,
+    runs_above,
+    way_along,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -111,7 +121,7 @@ def fit_rows(
         ``end_m``, ``length_m`` along γ.
     """
     curves = [resample(extend(shapely.get_coordinates(line), MARGIN), CELL) for line in courses.geometry]
-    half = np.minimum(0.8, 0.42 * courses["spacing_m"].to_numpy())
+    half = half_width(courses["spacing_m"].to_numpy())
     fits: list[_Fit | None] = []
     if curves:
         canopy = np.clip((heights - low) / RAMP + 0.5, 0, 1) * np.clip((high - heights) / RAMP + 0.5, 0, 1)

@@ -67,6 +67,11 @@ def at(curve: Values, position: Values) -> Values:
     return np.column_stack([np.interp(position, way, curve[:, k]) for k in (0, 1)])
 
 
+def half_width(spacing: Values | float) -> Values:
+    """Metres to both sides of a row, of a spacing in metres, in which its canopy is looked for."""
+    return np.minimum(0.8, 0.42 * np.asarray(spacing))
+
+
 def tangents(curve: Values, position: Values) -> Values:
     """Unit tangents (m, 2) of a curve (n, 2) at metres (m,) along it, over half a metre."""
     chord = at(curve, position + 0.25) - at(curve, position - 0.25)

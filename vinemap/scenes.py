@@ -211,7 +211,7 @@ def family(name: str, seed: int) -> Survey:
     return FAMILIES[name](np.random.default_rng([seed, *name.encode()]))._replace(name=name)
 
 
-def _block(rng: np.random.Generator, **shape: Any) -> list[Array]:  # noqa: ANN401
+def _block(rng: np.random.Generator, **shape: Any) -> list[Array]:
     """Rows as vineyards have them, of any direction, but for what is given."""
     usual: dict[str, Any] = {
         "n": rng.integers(6, 10),
@@ -229,7 +229,7 @@ def _survey(
     slope: float | None = None,
     terrain: Terrain | None = None,
     ragged: float = 1.2,
-    **options: Any,  # noqa: ANN401
+    **options: Any,
 ) -> Survey:
     """Survey blocks, a parcel each, whose rows end up to ``ragged`` m early; what isn't given is as it often is."""
     vines: dict[str, Any] = {
@@ -302,7 +302,7 @@ def _clutter(rng: np.random.Generator) -> Survey:
     cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
     side = n / 2 * spacing
 
-    def at(along: float, across: float, size: tuple[float, float], top: float, **kind: Any) -> Obstacle:  # noqa: ANN401
+    def at(along: float, across: float, size: tuple[float, float], top: float, **kind: Any) -> Obstacle:
         x, y = PLACE[0] + along * cos - across * sin, PLACE[1] + along * sin + across * cos
         return Obstacle(x, y, *size, top, azimuth=azimuth, **kind)
 

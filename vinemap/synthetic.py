@@ -226,7 +226,7 @@ def write_survey(survey: Survey, folder: Path | str) -> Path:
 
     All three are made aside and then moved into ``folder``, the cloud last, so nothing half-made is ever there.
     """
-    import laspy  # noqa: PLC0415 - only the writer needs it
+    import laspy  # only the writer needs it
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
