@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
-BASE = {"errors", "crs"}
+BASE = {"errors", "crs", "compiled"}
 DATA = {"cloud", "raster", "vector", "mesh", "row_frame"}
 STAGES = {
     "ground",
@@ -36,6 +36,7 @@ CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
 MAY_IMPORT = {
     "__init__": set(),
     "errors": set(),
+    "compiled": set(),
     "crs": {"errors"},
     "style": set(),
     **dict.fromkeys(DATA, BASE | DATA | {"style"}),

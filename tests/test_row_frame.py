@@ -26,8 +26,8 @@ def test_points_go_to_the_nearest_row():
     xyz = np.random.default_rng(0).uniform([0, -1, 0], [10, 3, 1], (5000, 3))
     near = row_coordinates(xyz, curves, np.array([1.25, 1.25]))
     y = xyz[near.member, 1]
-    assert (y[near.row == 0] < 1.13).all()
-    assert (y[near.row == 1] > 0.87).all()
+    assert (y[: near.start[1]] < 1.13).all()
+    assert (y[near.start[1] :] > 0.87).all()
 
 
 def test_lengths_ends_and_parts():

@@ -1,21 +1,19 @@
 """Sections of canopy: convex hull, outlier peeling (Algorithm 1) and the minimum-area c-gon (Problem 1).
 
 A section's points are (y, z) in metres, z up and y drawn to the right; polygons run counter-clockwise.
-Compiled code (cached on disk, without the GIL) takes them as complex numbers y + iz. It stays in one file, because
-numba's cache doesn't notice changes in others.
+Compiled code takes them as complex numbers y + iz; it stays in one file, as compiled functions must.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from vinemap.compiled import compiled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import ArrayLike, NDArray
 
     Points = NDArray[np.complex128]
@@ -23,21 +21,12 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
 
-F = TypeVar("F", bound="Callable[..., object]")
-
 FLAT = 1e-12
 """Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""
 LONGEST = 256
 """An outline of more edges is first simplified from outside: no two edges in a row turn by less than 360°/LONGEST."""
-
-
-def _compiled(function: F) -> F:
-    try:
-        return cast("F", njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # no folder for the cache can be written: compile anew each time
-        return cast("F", njit(nogil=True)(function))
 
 
 class Enclosures(NamedTuple):
@@ -130,13 +119,13 @@ def as_pairs(points: Points) -> Floats:
     return np.ascontiguousarray(points).view(np.float64).reshape(*points.shape, 2)
 
 
-@_compiled
+@compiled
 def _cross(a: complex, b: complex, p: complex) -> float:
     """Twice the area of (a, b, p): positive where p is left of a → b."""
     return (b.real - a.real) * (p.imag - a.imag) - (b.imag - a.imag) * (p.real - a.real)
 
 
-@_compiled
+@compiled
 def _area(polygon: Points) -> float:
     """Shoelace area, positive if counter-clockwise (Eq. 13 without its absolute values)."""
     total = 0.0
@@ -145,7 +134,7 @@ def _area(polygon: Points) -> float:
     return total / 2
 
 
-@_compiled
+@compiled
 def _sorted(p: Points) -> Ints:
     """Order by y, then z, then index (bottom-up merge sort)."""
     n = len(p)
@@ -171,7 +160,7 @@ def _sorted(p: Points) -> Ints:
     return order
 
 
-@_compiled
+@compiled
 def _append(p: Points, chain: Ints, floor: int, size: int, i: int) -> int:
     """Add point i to the convex chain that begins at chain[floor], dropping those that it hides; the new size."""
     while size - floor >= 2 and _cross(p[chain[size - 2]], p[chain[size - 1]], p[i]) <= 0:
@@ -180,7 +169,7 @@ def _append(p: Points, chain: Ints, floor: int, size: int, i: int) -> int:
     return size + 1
 
 
-@_compiled
+@compiled
 def _hull(p: Points) -> Ints:
     """Positions on the hull of sorted points (monotone chain)."""
     n = len(p)
@@ -198,7 +187,7 @@ def _hull(p: Points) -> Ints:
     return chain[: max(size - 1, 1)]
 
 
-@_compiled
+@compiled
 def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
     """Extend the chain from its last point to ``stop`` over the inner points right of the line between them."""
     floor = size - 1
@@ -211,7 +200,7 @@ def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
     return _append(p, chain, floor, size, stop) if stop != first else size
 
 
-@_compiled
+@compiled
 def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[int, float]:
     """Hull from one neighbour of u to the other once u is gone: size of ``chain``, and twice the area lost."""
     a, b = ring[0, u], ring[1, u]
@@ -240,7 +229,7 @@ def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[i
     return size, loss
 
 
-@_compiled
+@compiled
 def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
     """Positions removed from sorted points, in order, and those on the hull that is left; ``index`` breaks ties."""
     n = len(p)
@@ -280,7 +269,7 @@ def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
     return removed[:done], left
 
 
-@_compiled
+@compiled
 def _place(ring: Points, foot: complex, side: float, extent: float) -> tuple[int, float, complex]:
     """Edge of the ring that holds a foot, where on it (0-1), and the foot, moved out sideways if it is inside.
 
@@ -305,7 +294,7 @@ def _place(ring: Points, foot: complex, side: float, extent: float) -> tuple[int
     return at, share, a + share * d
 
 
-@_compiled
+@compiled
 def _outline(rest: Points, right: complex, left: complex) -> Points:
     """Vertices (n + 1,) of the hull of a convex polygon and both feet, from the right foot round to the left one."""
     corners = np.empty(len(rest) + 2, dtype=np.complex128)
@@ -335,7 +324,7 @@ def _outline(rest: Points, right: complex, left: complex) -> Points:
     return out[: size + 1]
 
 
-@_compiled
+@compiled
 def _turn(q: Points, i: int, j: int) -> float:
     """Sine of the turn from edge i of the outline to edge j, times their lengths; 0 where it is 0 or 180°."""
     a, b = q[i + 1] - q[i], q[j + 1] - q[j]
@@ -343,7 +332,7 @@ def _turn(q: Points, i: int, j: int) -> float:
     return sine if abs(sine) > FLAT * abs(a) * abs(b) else 0.0
 
 
-@_compiled
+@compiled
 def _corner(q: Points, i: int, j: int) -> tuple[complex, float]:
     """Where edges i < j of the outline meet, and twice the area of (q[i + 1], corner, q[j]); infinite if they don't."""
     turn = _turn(q, i, j)
@@ -353,7 +342,7 @@ def _corner(q: Points, i: int, j: int) -> tuple[complex, float]:
     return corner, _cross(q[i + 1], corner, q[j])
 
 
-@_compiled
+@compiled
 def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
     """Ends of the edge between edges i < j that touches the outline at its midpoint, where that can beat flush edges.
 
@@ -375,7 +364,7 @@ def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
     return one, two, least
 
 
-@_compiled
+@compiled
 def _choose(q: Points, c: int) -> Points:
     """The c - 3 free vertices: c - 2 of the outline's edges, first and last included, that add the least area to it.
 
@@ -403,7 +392,7 @@ def _choose(q: Points, c: int) -> Points:
     return _trace(q, origin, 1 if cost[1, edges - 1, n - 1] < cost[0, edges - 1, n - 1] else 0)
 
 
-@_compiled
+@compiled
 def _trace(q: Points, origin: Ints, spent: int) -> Points:
     """The vertices of a choice, from its last edge back."""
     used, j = origin.shape[1] - 1, origin.shape[2] - 1
@@ -421,7 +410,7 @@ def _trace(q: Points, origin: Ints, spent: int) -> Points:
     return free
 
 
-@_compiled
+@compiled
 def _simplify(q: Points) -> Points:
     """A circumscribed outline of fewer edges (see LONGEST), first and last edge kept."""
     n, size, last = len(q) - 1, 1, 0
@@ -437,7 +426,7 @@ def _simplify(q: Points) -> Points:
     return out[: size + 1]
 
 
-@_compiled
+@compiled
 def _split(q: Points, c: int) -> Points:
     """The inner vertices of an outline of c - 2 edges or fewer, its longest edges halved until there are c - 3."""
     out = np.empty(c - 1, dtype=np.complex128)
@@ -454,7 +443,7 @@ def _split(q: Points, c: int) -> Points:
     return out[1:-1]
 
 
-@_compiled
+@compiled
 def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: Points) -> None:
     """Write the c-gon around a convex polygon to ``out`` (c,)."""
     if right.real < left.real:
@@ -476,7 +465,7 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
                 out[0] = (q[0] + q[-1]) / 2
 
 
-@_compiled
+@compiled
 def _enclose_all(
     points: Points, start: Ints, feet: Points, c: int, share: float
 ) -> tuple[Points, Flags, Floats, Floats]:

@@ -13,7 +13,7 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.raster import Raster, sample
+from vinemap.raster import Raster, sample_across
 from vinemap.row_frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
 
 if TYPE_CHECKING:
@@ -182,8 +182,7 @@ def _straighten(cover: Raster, curve: Values, half: float) -> tuple[Values, Valu
     """Cover (stations, cells across) along a curve, and the cells' offsets to the left in metres."""
     n = int(np.ceil(half / BIN))
     offsets = np.arange(-n, n + 1) * BIN
-    left = normals(curve, smoothing=1 / STATION)
-    return sample(cover, curve[:, None] + offsets[:, None] * left[:, None]), offsets
+    return sample_across(cover, curve, normals(curve, smoothing=1 / STATION), offsets), offsets
 
 
 def _turn(curve: Values) -> float:

@@ -8,7 +8,7 @@ import geopandas as gpd
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from vinemap.raster import cell_of, sample
+from vinemap.raster import cell_of, sample, sample_across
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -116,7 +116,7 @@ def _profiles(
     normal = np.column_stack([-np.sin(direction), np.cos(direction)])
     profile = np.zeros((len(nodes), len(offsets)))
     for along in np.linspace(-slice_width / 2, slice_width / 2, SLICES):
-        profile += sample(cover, (origin + along * tangent)[:, None] + offsets[:, None] * normal[:, None])
+        profile += sample_across(cover, origin + along * tangent, normal, offsets)
     return profile / SLICES, offsets
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from affine import Affine
-from scipy.ndimage import map_coordinates
 
+from vinemap.compiled import compiled
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,13 +93,7 @@ def coarser(grid: Grid, *, resolution: float) -> Grid:
 
 def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int64]:
     """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
-    j = ((xy[:, 0] - grid.west) / grid.resolution).astype(np.int64)
-    i = ((grid.north - xy[:, 1]) / grid.resolution).astype(np.int64)
-    np.clip(j, 0, grid.nx - 1, out=j)
-    np.clip(i, 0, grid.ny - 1, out=i)
-    i *= grid.nx
-    i += j
-    return i
+    return _cells(_columns(xy), grid)
 
 
 def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
@@ -110,20 +104,77 @@ def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
 def block_sum(values: NDArray[np.floating], k: int) -> NDArray[np.floating]:
     """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)); beyond the edge there is nothing."""
     ny, nx = (-(-n // k) for n in values.shape)
-    padding = [(0, ny * k - values.shape[0]), (0, nx * k - values.shape[1])]
-    out: NDArray[np.floating] = np.pad(values, padding).reshape(ny, k, nx, k).sum(axis=(1, 3))
+    padded = np.zeros((ny * k, nx * k))
+    padded[: values.shape[0], : values.shape[1]] = values
+    down = sum(padded[i::k] for i in range(k))
+    out: NDArray[np.floating] = sum(down[:, j::k] for j in range(k))
     return out
 
 
 def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
     points = np.asarray(xy, dtype=float)
-    grid = raster.grid
-    j = (points[..., 0] - grid.west) / grid.resolution - 0.5
-    i = (grid.north - points[..., 1]) / grid.resolution - 0.5
-    out: NDArray[np.float64] = map_coordinates(
-        raster.values, [i.ravel(), j.ravel()], order=1, mode="nearest", output=np.float64
-    ).reshape(i.shape)
+    flat = _columns(points.reshape(-1, points.shape[-1]))
+    return _bilinear(_columns(raster.values), raster.grid, flat).reshape(points.shape[:-1])
+
+
+def sample_across(
+    raster: Raster, origin: NDArray[np.floating], normal: NDArray[np.floating], offsets: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Bilinear values (n, m) at offsets (m,) from origins (n, 2) along unit vectors (n, 2)."""
+    return _bilinear_across(_columns(raster.values), raster.grid, _columns(origin), _columns(normal), offsets)
+
+
+def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The same (n, k) as compiled code wants it."""
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+@compiled
+def _cells(xy: NDArray[np.float64], grid: Grid) -> NDArray[np.int64]:
+    out = np.empty(len(xy), dtype=np.int64)
+    for p in range(len(xy)):
+        j = min(max(int((xy[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
+        i = min(max(int((grid.north - xy[p, 1]) / grid.resolution), 0), grid.ny - 1)
+        out[p] = i * grid.nx + j
+    return out
+
+
+@compiled
+def _value(values: NDArray[np.float64], grid: Grid, x: float, y: float) -> float:
+    ny, nx = values.shape
+    j = min(max((x - grid.west) / grid.resolution - 0.5, 0.0), nx - 1.0)
+    i = min(max((grid.north - y) / grid.resolution - 0.5, 0.0), ny - 1.0)
+    west, north = min(int(j), max(nx - 2, 0)), min(int(i), max(ny - 2, 0))
+    east, south = min(west + 1, nx - 1), min(north + 1, ny - 1)
+    j -= west
+    i -= north
+    upper = values[north, west] * (1 - j) + values[north, east] * j
+    lower = values[south, west] * (1 - j) + values[south, east] * j
+    return float(upper * (1 - i) + lower * i)
+
+
+@compiled
+def _bilinear(values: NDArray[np.float64], grid: Grid, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    out = np.empty(len(xy))
+    for p in range(len(xy)):
+        out[p] = _value(values, grid, xy[p, 0], xy[p, 1])
+    return out
+
+
+@compiled
+def _bilinear_across(
+    values: NDArray[np.float64],
+    grid: Grid,
+    origin: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    out = np.empty((len(origin), len(offsets)))
+    for p in range(len(origin)):
+        for k in range(len(offsets)):
+            x, y = origin[p, 0] + offsets[k] * normal[p, 0], origin[p, 1] + offsets[k] * normal[p, 1]
+            out[p, k] = _value(values, grid, x, y)
     return out
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from scipy.ndimage import gaussian_filter
 
+from vinemap.compiled import compiled
 from vinemap.raster import Raster, cell_of, sample
 from vinemap.row_frame import (
     between,
@@ -25,6 +26,7 @@ from vinemap.row_frame import (
     row_coordinates,
     runs_above,
     way_along,
+    whittaker,
 )
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
+COURSE = 12.0
+"""Wavelength in metres below which a course's bends are not trusted."""
 POINTS_A_METRE = 200.0
 """Canopy points in a metre of row for which the smoothing is meant."""
 RAMP = 0.1
@@ -48,6 +52,8 @@ REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
+PASSES = 3
+"""Times that the centre line is drawn through an image that the last one has straightened."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
 
@@ -60,17 +66,10 @@ class _Fit(NamedTuple):
     contrast: float
 
 
-class _Points(NamedTuple):
-    """Coordinates (n, 3), and how far (n,) each is canopy, 0 to 1."""
-
-    xyz: Values
-    canopy: Values
-
-
 class _Share(NamedTuple):
-    """Points of one row: their station of n along it, metres to its left, and canopy 0 to 1."""
+    """Points of one row: where along its n stations, metres to its left, and canopy 0 to 1."""
 
-    station: NDArray[np.int64]
+    station: Values
     left: Values
     canopy: Values
     n: int
@@ -120,24 +119,17 @@ def fit_rows(
         (of the canopy to the ground beside it, 0–1); LineStringZ with ``row`` (position in rows), ``start_m``,
         ``end_m``, ``length_m`` along γ.
     """
-    curves = [resample(extend(shapely.get_coordinates(line), MARGIN), CELL) for line in courses.geometry]
+    curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
     fits: list[_Fit | None] = []
-    if curves:
-        canopy = np.clip((heights - low) / RAMP + 0.5, 0, 1) * np.clip((high - heights) / RAMP + 0.5, 0, 1)
-        canopy *= cover.values.ravel()[cell_of(cloud.xyz, cover.grid)] > 0
-        points = _Points(cloud.xyz, canopy)
-        points, shares = _deal(points, curves, half)
-        for k, share in enumerate(shares):
-            shift: Values = np.zeros(len(curves[k]))
-            cutoff = smoothing / CELL * _noise_stretch(share, half[k])
-            for _ in range(3):
-                image, offsets = _straighten(share, shift, half[k])
-                shift = centre_line(image, offsets, shift, reach=0.75 * half[k], cutoff=cutoff)
-            curves[k] = _shifted(curves[k], shift)
-        points, shares = _deal(points, curves, half)
-        for curve, share, reach in zip(curves, shares, half, strict=True):
-            fits.append(_ends(curve, _straighten(share, np.zeros(len(curve)), reach)[0], end_share))
+    for k, share in enumerate(_deal(cloud, heights, cover, curves, half, low, high)):
+        shift: Values = np.zeros(len(curves[k]))
+        cutoff = smoothing / CELL * _noise_stretch(share, half[k])
+        for _ in range(PASSES):
+            image, offsets = _straighten(share, shift, half[k])
+            shift = centre_line(image, offsets, shift, reach=0.75 * half[k], cutoff=cutoff)
+        curve = curves[k] + shift[:, None] * normals(curves[k], smoothing=1 / CELL)
+        fits.append(_ends(curve, _straighten(share, shift, half[k])[0], end_share))
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
     for fit, spacing in zip(fits, courses["spacing_m"], strict=True):
@@ -155,19 +147,32 @@ def fit_rows(
     )
 
 
-def _deal(points: _Points, curves: Sequence[Values], half: Values) -> tuple[_Points, list[_Share]]:
-    """Points near the curves, and each curve's share of them in its own frame."""
-    near = row_coordinates(points.xyz, curves, half + REACH)
-    order = np.argsort(near.row.astype(np.int16), kind="stable")  # sixteen bits are sorted by radix
-    first = np.searchsorted(near.row[order], np.arange(len(curves) + 1))
+def _smooth_course(course: Values) -> Values:
+    """Course without the bends that the centre line is to find, carried on beyond its ends."""
+    curve = resample(extend(course, MARGIN), CELL)
+    way = way_along(curve)
+    known = ((way >= MARGIN) & (way <= way[-1] - MARGIN)).astype(float)
+    chord = np.linspace(curve[0], curve[-1], len(curve))
+    bend = [whittaker(values, known, cutoff=COURSE / CELL) for values in (curve - chord).T]
+    return resample(chord + np.column_stack(bend), CELL)
+
+
+def _deal(
+    cloud: PointCloud, heights: Values, cover: Raster, curves: Sequence[Values], half: Values, low: float, high: float
+) -> list[_Share]:
+    """Each curve's share of the points near it, in its own frame."""
+    if not curves:
+        return []
+    near = row_coordinates(cloud.xyz, curves, half + REACH)
+    height = heights[near.member]
+    canopy = np.clip((height - low) / RAMP + 0.5, 0, 1) * np.clip((high - height) / RAMP + 0.5, 0, 1)
+    canopy *= cover.values.ravel()[cell_of(cloud.xyz[near.member], cover.grid)] > 0
     shares = []
     for k, curve in enumerate(curves):
-        mine = order[first[k] : first[k + 1]]
-        station = np.rint(near.along[mine] / way_along(curve)[-1] * (len(curve) - 1)).astype(np.int64)
-        inside = (station >= 0) & (station < len(curve))
-        mine = mine[inside]
-        shares.append(_Share(station[inside], near.left[mine], points.canopy[near.member[mine]], len(curve)))
-    return _Points(points.xyz[near.member], points.canopy[near.member]), shares
+        mine = slice(near.start[k], near.start[k + 1])
+        station = near.along[mine] * ((len(curve) - 1) / way_along(curve)[-1])
+        shares.append(_Share(station, near.left[mine], canopy[mine], len(curve)))
+    return shares
 
 
 def _noise_stretch(share: _Share, half: float) -> float:
@@ -179,20 +184,35 @@ def _noise_stretch(share: _Share, half: float) -> float:
 def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
     m = int(np.ceil(half / CELL))
-    column = np.rint((share.left - shift[share.station]) / CELL).astype(np.int64) + m
-    inside = (column >= 0) & (column <= 2 * m)
-    shape = (share.n, 2 * m + 1)
-    cell = share.station[inside] * shape[1] + column[inside]
-    everything = np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape).astype(float)
-    leaves = np.bincount(cell, weights=share.canopy[inside], minlength=shape[0] * shape[1]).reshape(shape)
+    leaves, everything = _spread(share.station, share.left, share.canopy, shift, m, CELL)
     density = max(float(everything.mean()), 1e-9)
     sigma = max(1.0, density**-0.5)
     image = gaussian_filter(leaves, sigma) / (gaussian_filter(everything, sigma) + 0.1 * density)
     return image, np.arange(-m, m + 1) * CELL
 
 
-def _shifted(curve: Values, offset: Values) -> Values:
-    return resample(curve + offset[:, None] * normals(curve, smoothing=1 / CELL), CELL)
+@compiled
+def _spread(
+    station: Values, left: Values, canopy: Values, shift: Values, m: int, cell: float
+) -> tuple[Values, Values]:
+    """Canopy and points (stations, 2 m + 1) in cells; each point is shared by the four whose centres surround it."""
+    n = len(shift)
+    leaves, everything = np.zeros((n, 2 * m + 1)), np.zeros((n, 2 * m + 1))
+    for p in range(len(station)):
+        if not 0 <= station[p] < n - 1:
+            continue
+        i = int(station[p])
+        down = station[p] - i
+        across = (left[p] - shift[i] * (1 - down) - shift[i + 1] * down) / cell + m
+        j = int(np.floor(across))
+        right = across - j
+        for b in range(2):
+            if 0 <= j + b <= 2 * m:
+                for a in range(2):
+                    part = (down if a else 1 - down) * (right if b else 1 - right)
+                    everything[i + a, j + b] += part
+                    leaves[i + a, j + b] += part * canopy[p]
+    return leaves, everything
 
 
 def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
@@ -201,16 +221,15 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
         return None
-    step = way_along(curve)[-1] / (len(curve) - 1)
     edge = end_share * float(np.median(present))
     # Thin canopies have holes: what a weaker trace joins is one run, from its first to its last full edge.
     weak = runs_above(profile, 0.5 * edge)
     full = runs_above(profile, edge)
     runs = [(f[0, 0], f[-1, 1]) for a, b in weak if len(f := full[(full[:, 0] >= a) & (full[:, 1] <= b)])]
-    runs = [(a, b) for a, b in runs if (b - a) * step >= SHORTEST]
-    if not runs:
+    metres = np.interp(np.reshape(runs, (-1, 2)), np.arange(len(curve)), way_along(curve))
+    metres = metres[np.diff(metres, axis=1)[:, 0] >= SHORTEST]
+    if len(metres) == 0:
         return None
-    metres = np.array(runs) * step
     living = image[profile > edge]
     aside = max(1, living.shape[1] // 8)
     beside = np.concatenate([living[:, :aside], living[:, -aside:]], axis=1).mean()

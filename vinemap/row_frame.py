@@ -5,16 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
 
-from vinemap.raster import cell_of, grid_over
+from vinemap.compiled import compiled
+from vinemap.raster import grid_over
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    from vinemap.raster import Grid
 
     Values = NDArray[np.floating]
 
@@ -27,10 +28,11 @@ GUIDE = 0.25
 
 
 class RowCoordinates(NamedTuple):
-    """Points near rows, in the frame of the nearest one."""
+    """Points near rows, in the frame of the nearest one: row by row, those of row k from ``start[k]`` to
+    ``start[k + 1]``."""
 
-    row: NDArray[np.int64]
-    """Position (n,) of the row in the list of curves."""
+    start: NDArray[np.int64]
+    """First point (rows + 1,) of each row."""
     along: Values
     """Metres (n,) along the row; negative before its start."""
     left: Values
@@ -39,26 +41,84 @@ class RowCoordinates(NamedTuple):
     """Index (n,) of the point in the cloud."""
 
 
+class _Guides(NamedTuple):
+    """Points on curves to which cloud points are referred: row (g,), metres along it, place and tangent (g, 2)."""
+
+    row: NDArray[np.int64]
+    along: Values
+    xy: Values
+    tangent: Values
+
+
 def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> RowCoordinates:
     """Refer the points (n, ≥2) within ``reach`` (rows,) metres of their nearest curve (k, 2) to it."""
     lengths = [float(way_along(curve)[-1]) for curve in curves]
-    guides = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
-    row = np.concatenate([np.full(len(g), k) for k, g in enumerate(guides)])
-    position = np.concatenate(guides)
-    guide = np.concatenate([at(curve, g) for curve, g in zip(curves, guides, strict=True)])
-    tangent = np.concatenate([tangents(curve, g) for curve, g in zip(curves, guides, strict=True)])
-    # The nearest guide of a cell is near enough to the nearest of its points: both are projected on its tangent.
-    grid = grid_over(xyz, resolution=GUIDE)
-    centres = np.stack(np.meshgrid(*grid.centres()), axis=-1).reshape(-1, 2)
-    distance, nearest = cKDTree(guide).query(centres, distance_upper_bound=float(reach.max()) + GUIDE, workers=-1)
-    member = np.flatnonzero(np.isfinite(distance)[cell_of(xyz, grid)])
-    near = xyz[member, :2]
-    g = nearest[cell_of(near, grid)]
-    offset = near - guide[g]
-    along = position[g] + (offset * tangent[g]).sum(axis=1)
-    left = tangent[g, 0] * offset[:, 1] - tangent[g, 1] * offset[:, 0]
-    inside = np.abs(left) <= reach[row[g]]
-    return RowCoordinates(row[g][inside], along[inside], left[inside], member[inside])
+    positions = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
+    guides = _Guides(
+        np.concatenate([np.full(len(g), k) for k, g in enumerate(positions)]),
+        np.concatenate(positions),
+        np.concatenate([at(curve, g) for curve, g in zip(curves, positions, strict=True)]),
+        np.concatenate([tangents(curve, g) for curve, g in zip(curves, positions, strict=True)]),
+    )
+    widest = float(reach.max()) + GUIDE
+    grid = grid_over(np.concatenate([guides.xy - widest, guides.xy + widest]), resolution=GUIDE)
+    nearest = _nearest_guides(guides.xy, grid, widest)
+    return RowCoordinates(*_refer(np.ascontiguousarray(xyz), grid, nearest, guides, reach.astype(float)))
+
+
+@compiled
+def _nearest_guides(xy: Values, grid: Grid, reach: float) -> NDArray[np.int64]:
+    """Guide (ny, nx) nearest to the centre of every cell, -1 where none is within reach.
+
+    It is near enough to the nearest of the cell's points: both project them on about the same tangent.
+    """
+    nearest = np.full((grid.ny, grid.nx), -1)
+    least = np.full((grid.ny, grid.nx), reach**2)
+    cells = int(np.ceil(reach / grid.resolution))
+    for g in range(len(xy)):
+        x, y = (xy[g, 0] - grid.west) / grid.resolution - 0.5, (grid.north - xy[g, 1]) / grid.resolution - 0.5
+        for i in range(max(int(y) - cells, 0), min(int(y) + cells + 2, grid.ny)):
+            for j in range(max(int(x) - cells, 0), min(int(x) + cells + 2, grid.nx)):
+                square = ((j - x) ** 2 + (i - y) ** 2) * grid.resolution**2
+                if square < least[i, j]:
+                    least[i, j] = square
+                    nearest[i, j] = g
+    return nearest
+
+
+@compiled
+def _refer(
+    xyz: Values, grid: Grid, nearest: NDArray[np.int64], guides: _Guides, reach: Values
+) -> tuple[NDArray[np.int64], Values, Values, NDArray[np.int64]]:
+    """Start, along, left and member of the points (n, ≥2) near the guides."""
+    guide = np.empty(len(xyz), dtype=np.int32)
+    start = np.zeros(len(reach) + 1, dtype=np.int64)
+    for p in range(len(xyz)):
+        guide[p] = -1
+        j, i = (xyz[p, 0] - grid.west) / grid.resolution, (grid.north - xyz[p, 1]) / grid.resolution
+        if j < 0 or i < 0 or j >= grid.nx or i >= grid.ny:
+            continue
+        g = nearest[int(i), int(j)]
+        if g < 0:
+            continue
+        x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
+        if abs(guides.tangent[g, 0] * y - guides.tangent[g, 1] * x) <= reach[guides.row[g]]:
+            guide[p] = g
+            start[guides.row[g] + 1] += 1
+    start = np.cumsum(start)
+    along, left = np.empty(start[-1]), np.empty(start[-1])
+    member = np.empty(start[-1], dtype=np.int64)
+    place = start.copy()
+    for p in range(len(xyz)):
+        g = guide[p]
+        if g >= 0:
+            x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
+            k = place[guides.row[g]]
+            along[k] = guides.along[g] + x * guides.tangent[g, 0] + y * guides.tangent[g, 1]
+            left[k] = guides.tangent[g, 0] * y - guides.tangent[g, 1] * x
+            member[k] = p
+            place[guides.row[g]] += 1
+    return start, along, left, member
 
 
 def at(curve: Values, position: Values) -> Values:
@@ -137,14 +197,11 @@ def centre_line(image: Values, offsets: Values, shift: Values, *, reach: float, 
     excess = np.maximum(smooth - 0.25 * strength, 0)
     centre = shift
     for _ in range(4):
-        # A soft edge, so that a cell more or less doesn't move the centroid.
-        soft = np.clip((reach - np.abs(offsets - (centre - shift)[:, None])) / 0.1 + 0.5, 0, 1)
-        near = excess * soft
-        weight = near.sum(axis=1)
+        amount, moment = _centroids(excess, offsets, centre - shift, reach)
         # Stations of a stray leaf or two tell nothing of the row's middle.
-        typical = np.quantile(weight, 0.7)
-        weight = weight * np.clip(2 * weight / max(typical, 1e-9) - 0.5, 0, 1)
-        measured = shift + (near @ offsets) / np.maximum(near.sum(axis=1), 1e-9)
+        typical = np.quantile(amount, 0.7)
+        weight = amount * np.clip(2 * amount / max(typical, 1e-9) - 0.5, 0, 1)
+        measured = shift + moment / np.maximum(amount, 1e-9)
         robust = np.ones(len(image))
         for _ in range(3):
             trusted = weight * robust
@@ -157,6 +214,19 @@ def centre_line(image: Values, offsets: Values, shift: Values, *, reach: float, 
     return centre
 
 
+@compiled
+def _centroids(excess: Values, offsets: Values, centre: Values, reach: float) -> tuple[Values, Values]:
+    """Sums (n,) of canopy (n, m) within reach of a centre (n,), plain and times its offset (m,)."""
+    amount, moment = np.zeros(len(excess)), np.zeros(len(excess))
+    for i in range(len(excess)):
+        for j in range(len(offsets)):
+            # A soft edge, so that a cell more or less doesn't move the centroid.
+            soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
+            amount[i] += excess[i, j] * soft
+            moment[i] += excess[i, j] * soft * offsets[j]
+    return amount, moment
+
+
 def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:
     """Smooth values (n,) by penalised least squares on their second and first differences (Eilers 2003).
 
@@ -164,27 +234,59 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 
     course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
     wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
     """
-    n = len(values)
-    if n < 3:
+    if len(values) < 3:
         return values
-    level = float(np.mean(weights)) or 1.0
-    penalty = level * (cutoff / (2 * np.pi)) ** 4
-    bands = np.zeros((3, n))
-    for k, c in enumerate((1.0, -2.0, 1.0)):
-        bands[2, k : n - 2 + k] += penalty * c * c
-    bands[1, 1:-1] += -2 * penalty
-    bands[1, 2:] += -2 * penalty
-    bands[0, 2:] += penalty
-    first = level * (slope / (2 * np.pi)) ** 2
-    bands[2, :-1] += first
-    bands[2, 1:] += first
-    bands[1, 1:] -= first
-    held = np.flatnonzero(weights >= 0.1 * level)
-    gap = np.ones(n, dtype=bool)
-    gap[held] = gap[: held[0] if len(held) else n] = gap[held[-1] + 1 if len(held) else n :] = False
-    bands[2] += weights + np.where(gap, max(ridge, 1e-9), 1e-9) * level
-    out: Values = solveh_banded(bands, weights * values)
-    return out
+    return _penalised(
+        np.asarray(values, dtype=float),
+        np.asarray(weights, dtype=float),
+        (cutoff / (2 * np.pi)) ** 4,
+        (slope / (2 * np.pi)) ** 2,
+        max(ridge, 1e-9),
+    )
+
+
+@compiled
+def _penalised(values: Values, weights: Values, second: float, first: float, ridge: float) -> Values:
+    """Minimise Σ w (x − v)² + level (second Σ (Δ²x)² + first Σ (Δx)² + ridge Σ x² between what has weights)."""
+    n = len(values)
+    level = weights.mean()
+    if level == 0:
+        level = 1.0
+    first_held, last_held = n, -1
+    for i in range(n):
+        if weights[i] >= 0.1 * level:
+            first_held, last_held = min(first_held, i), i
+    # Of L D Lᵀ, the factors of the symmetric matrix with two bands, D and both bands of L.
+    d, one, two = np.empty(n), np.zeros(n), np.zeros(n)
+    x = np.empty(n)
+    for i in range(n):
+        inner = second * level
+        diagonal = inner * ((i < n - 2) + 4 * (0 < i < n - 1) + (i > 1))
+        beside = inner * -2.0 * ((i < n - 2) + (0 < i < n - 1)) - first * level * (i < n - 1)
+        after = inner * (i < n - 2)
+        diagonal += first * level * ((i > 0) + (i < n - 1)) + weights[i]
+        between_held = first_held < i < last_held and weights[i] < 0.1 * level
+        diagonal += level * (ridge if between_held else 1e-9)
+        x[i] = weights[i] * values[i]
+        if i > 0:
+            beside -= d[i - 1] * one[i - 1] * two[i - 1]
+            diagonal -= d[i - 1] * one[i - 1] ** 2
+            x[i] -= one[i - 1] * x[i - 1]
+        if i > 1:
+            diagonal -= d[i - 2] * two[i - 2] ** 2
+            x[i] -= two[i - 2] * x[i - 2]
+        d[i] = diagonal
+        if i < n - 1:
+            one[i] = beside / diagonal
+        if i < n - 2:
+            two[i] = after / diagonal
+    for i in range(n - 1, -1, -1):
+        x[i] /= d[i]
+        if i < n - 1:
+            x[i] -= one[i] * x[i + 1]
+        if i < n - 2:
+            x[i] -= two[i] * x[i + 2]
+    return x
 
 
 def runs_above(profile: Values, level: float) -> Values:

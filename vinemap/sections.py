@@ -59,7 +59,7 @@ def cut_sections(
     near = row_coordinates(cloud.xyz, curves, 0.5 * rows["spacing_m"].to_numpy())
     # Rows are laid one behind the other so that one sort, and one search, finds the points of every section.
     stride = max(line.length for line in lines) + 10 * width + 10
-    key = near.row * stride + near.along
+    key = np.repeat(np.arange(len(lines)), np.diff(near.start)) * stride + near.along
     order = np.argsort(key)
     key, left, member = key[order], near.left[order], near.member[order]
 
