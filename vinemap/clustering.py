@@ -14,6 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from vinemap.compiled import compiled
+
 if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
@@ -98,19 +100,51 @@ def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Value
         Direction of the row at each point in radians, semi-axes of its ellipse in metres (Eq. 4–5).
     """
     n = len(xy)
-    pairs = cKDTree(xy).query_pairs(float(along.max(initial=0)), output_type="ndarray")
-    linked = np.zeros(len(pairs), dtype=bool)
-    for a, b in ((0, 1), (1, 0)):
-        i = pairs[:, a]
-        offset = xy[pairs[:, b]] - xy[i]
-        cos, sin = np.cos(direction[i]), np.sin(direction[i])
-        x = offset[:, 0] * cos + offset[:, 1] * sin
-        y = offset[:, 1] * cos - offset[:, 0] * sin
-        linked |= (x / along[i]) ** 2 + (y / across[i]) ** 2 <= 1
-    i, j = pairs[linked].T
-    # A graph's zero is no edge, so that points on one spot need a length.
-    distance = np.maximum(np.hypot(*(xy[j] - xy[i]).T), 1e-6)
+    cell = max(float(along.max(initial=0)), float(across.max(initial=0)), 1e-6)
+    column = np.floor((xy - xy.min(axis=0, initial=np.inf)) / cell).astype(np.int64) + 1
+    wide = int(column[:, 1].max(initial=0)) + 2
+    key = column[:, 0] * wide + column[:, 1]
+    order = np.argsort(key, kind="stable")
+    first = np.searchsorted(key[order], np.arange((int(column[:, 0].max(initial=0)) + 2) * wide + 1))
+    axis = np.column_stack([np.cos(direction), np.sin(direction)])
+    i, j, distance = _linked(xy, axis, along, across, key, wide, order, first)
     return coo_array((distance, (i, j)), shape=(n, n)).tocsr()
+
+
+@compiled
+def _linked(
+    xy: Values,
+    axis: Values,
+    along: Values,
+    across: Values,
+    key: Labels,
+    wide: int,
+    order: Labels,
+    first: Labels,
+) -> tuple[Labels, Labels, Values]:
+    """Pairs of points i < j of which one lies in the other's ellipse, and their distance.
+
+    Points are sorted (``order``) into the cells of a grid ``wide`` columns wide, no smaller than the ellipses; those
+    of a cell start at ``first``.
+    """
+    rows, columns, distances = [], [], []
+    for i in range(len(xy)):
+        for c in range(9):
+            cell = key[i] + (c // 3 - 1) * wide + c % 3 - 1
+            for j in order[first[cell] : first[cell + 1]]:
+                if j <= i:
+                    continue
+                x, y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+                for p in (i, j):
+                    u = x * axis[p, 0] + y * axis[p, 1]
+                    v = y * axis[p, 0] - x * axis[p, 1]
+                    if (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1:
+                        rows.append(i)
+                        columns.append(j)
+                        # A graph's zero is no edge, so that points on one spot need a length.
+                        distances.append(max(np.hypot(x, y), 1e-6))
+                        break
+    return np.array(rows), np.array(columns), np.array(distances)
 
 
 class _Ends(NamedTuple):

@@ -161,7 +161,7 @@ def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
     curve = np.column_stack([whittaker(curve[:, k], even, cutoff=ZIGZAG / STATION) for k in (0, 1)])
     for reach in (half, 0.75 * half):
         image, offsets = _straighten(cover, curve, half)
-        shift = centre_line(image, offsets, np.zeros(len(curve)), reach=reach, cutoff=SMOOTHING / STATION)
+        shift = centre_line(image, offsets, reach=reach, cutoff=SMOOTHING / STATION)
         curve = resample(curve + shift[:, None] * normals(curve, smoothing=1 / STATION), STATION)
     image, offsets = _straighten(cover, curve, half)
     profile = image.sum(axis=1) * BIN

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
+from vinemap.compiled import compiled
 from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, sample
 
 if TYPE_CHECKING:
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
-STEP = 0.001
-"""Heights are sorted in steps of a millimetre."""
+STEP, LOWEST, BITS = 0.001, -500.0, 20
+"""Heights are sorted in steps of a millimetre, from so many metres, as integers of so many bits."""
+MOST_STEPS = 2**BITS - 1
 EVEN = 0.02
 """Metres that terrain may rise from cell to cell above what a fit was made along."""
 WEEDS = 0.3
@@ -133,7 +135,7 @@ def canopy_height_model(cloud: PointCloud, heights: NDArray[np.floating], *, res
 
 def _coarse_surface(xyz: Values, grid: Grid) -> Values:
     """Smooth surface (ny, nx) through the low parts of a cloud, blind to what stands on it or floats below."""
-    reference = float(np.median(xyz[:, 2]))
+    reference = float(np.round(xyz[:, 2].mean()))
     cells = _order_statistics(xyz[:, 2] - reference, cell_of(xyz, grid), grid, 0.05)
     # Local planes are held to zero where cells are few, so the hillside must be gone first: an upper edge that stood
     # out above them would be taken for a house.
@@ -169,20 +171,28 @@ def _trend(cells: _Cells) -> Values:
 
 
 def _order_statistics(heights: NDArray[np.floating], cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
-    """Quantiles of heights in cells: one sort of integers that hold the cell above and the height below."""
-    lowest = -500.0
-    steps = np.clip((heights - lowest) / STEP, 0, 2**20 - 1).astype(np.int64)
-    keys = np.sort((cells << 20) | steps)
-    ordered = (keys & (2**20 - 1)) * STEP + lowest
-    n = np.bincount(cells, minlength=grid.ny * grid.nx)
-    first = np.concatenate([[0], np.cumsum(n)[:-1]])
+    """Quantiles of heights in cells, by one sort."""
+    keys, n = _keys(heights, cells, grid.ny * grid.nx)
+    keys.sort()
+    first = np.cumsum(n) - n
 
     def at(q: float) -> Values:
-        rank = np.ceil(q * n).astype(np.int64) - 1
-        index = np.minimum(first + np.maximum(rank, 0), len(ordered) - 1)
-        return np.where(n > 0, ordered[index], 0.0).reshape(grid.shape)
+        rank = np.maximum(np.ceil(q * n).astype(np.int64) - 1, 0)
+        found = keys[np.minimum(first + rank, len(keys) - 1)] & MOST_STEPS
+        return np.where(n > 0, found * STEP + LOWEST, 0.0).reshape(grid.shape)
 
     return _Cells(n.reshape(grid.shape).astype(float), at(quantile), at(0.5), at(0.9))
+
+
+@compiled
+def _keys(heights: Values, cells: NDArray[np.int64], n_cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Integers (n,) that hold a point's cell above and its height below, and the points of each cell."""
+    keys, n = np.empty(len(cells), dtype=np.int64), np.zeros(n_cells, dtype=np.int64)
+    for p in range(len(cells)):
+        step = min(max(int((heights[p] - LOWEST) / STEP), 0), MOST_STEPS)
+        keys[p] = cells[p] << BITS | step
+        n[cells[p]] += 1
+    return keys, n
 
 
 def _depth(n: Values, quantile: float) -> Values:

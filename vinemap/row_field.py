@@ -12,13 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import rfft2
-from scipy.ndimage import (
-    map_coordinates,
-    maximum_filter,
-)
+from scipy.fft import fft, rfft
+from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
+from vinemap.compiled import compiled
 from vinemap.raster import Grid, Raster, RowField, coarser
 
 if TYPE_CHECKING:
@@ -33,7 +31,7 @@ COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
-HARMONICS = (1, 2, 3)
+HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
 BATCH = 512
 
@@ -118,54 +116,66 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     size = windows.shape[-1]
     wide = PADDING * size
     mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
-    spectrum = rfft2((windows - mean[:, None, None]) * taper, s=(wide, wide), axes=(1, 2), workers=2)
-    power = np.roll(np.abs(spectrum) ** 2, wide // 2, axis=1)
-    fy = (np.arange(wide) - wide // 2)[:, None] / (wide * COVER_RESOLUTION)
-    fx = np.arange(wide // 2 + 1)[None, :] / (wide * COVER_RESOLUTION)
-    frequency = np.hypot(fy, fx)
-    inside = (frequency >= 1 / band[1]) & (frequency <= 1 / band[0])
-    # A real signal's spectrum is symmetric: the half that is kept holds the column fx = 0 whole.
-    whole = np.where(fx == 0, 0.5, 1.0) * (frequency >= 1 / (1.5 * band[1]))
-    variance = np.einsum("kij,ij->k", power, whole)
-    flat = np.where(inside, power, 0.0).reshape(len(power), -1)
-    best = flat.argmax(axis=1)
-    i, j = np.unravel_index(best, frequency.shape)
-    # The half spectrum has no columns left of fx = 0, so a peak on that edge is refined along fy alone.
-    i = np.clip(i, 1, wide - 2)
-    k = np.arange(len(power))
-    log = np.log(power + 1e-12)
-    di = _vertex(log[k, i - 1, j], log[k, i, j], log[k, i + 1, j])
-    left = np.where(j > 0, log[k, i, np.maximum(j - 1, 0)], log[k, wide - i, 1])
-    dj = _vertex(left, log[k, i, j], log[k, i, np.minimum(j + 1, wide // 2)])
-    unit = wide * COVER_RESOLUTION
-    y, x = (i + di - wide // 2) / unit, (j + dj) / unit
-    waves = sum(_lobe(power, n * (i - wide // 2) + wide // 2, n * j) for n in HARMONICS)
-    strength = np.clip(waves / np.maximum(variance, 1e-12), 0, 1)
+    rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2, workers=-1)
+    spectrum = fft(rows, n=wide, axis=1, workers=-1)
+    y, x, strength = _strongest(spectrum, COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
     direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
     return np.stack([direction, 1 / np.hypot(x, y), strength])
 
 
-def _lobe(power: Values, i: NDArray[np.int64], j: NDArray[np.int64]) -> Values:
-    """Power (k,) of the main lobe around one bin (k,) of each spectrum; none beyond the spectrum's edge."""
-    n, half = power.shape[1], power.shape[2] - 1
-    k = np.arange(len(power))
-    total = np.zeros(len(power))
-    reach = 2 * PADDING
-    for a in range(-reach, reach + 1):
-        for b in range(-reach, reach + 1):
-            mirrored = j + b < 0
-            row, column = np.where(mirrored, n - (i + a), i + a), np.abs(j + b)
-            valid = (row >= 0) & (row < n) & (column <= half)
-            total += np.where(valid, power[k, np.clip(row, 0, n - 1), np.minimum(column, half)], 0.0)
-    return total
+@compiled
+def _strongest(
+    spectrum: NDArray[np.complex64], cell: float, shortest: float, longest: float, harmonics: int, reach: int
+) -> tuple[Values, Values, Values]:
+    """Frequency of the strongest wave (y and x, cycles a metre) of spectra (k, n, n/2 + 1), and its strength 0–1.
+
+    The strength is the share of the power beyond long waves that the main lobes (``reach`` bins wide) about the
+    wave and its harmonics hold.
+    """
+    windows, n, _ = spectrum.shape
+    half = n // 2
+    unit = n * cell
+    lowest, highest, long = (unit / longest) ** 2, (unit / shortest) ** 2, (unit / longest / 1.5) ** 2
+    y, x, strength = np.empty(windows), np.empty(windows), np.empty(windows)
+    for k in range(windows):
+        power = spectrum[k].real ** 2 + spectrum[k].imag ** 2
+        total, most = 0.0, -1.0
+        best_i, best_j = 0, 0
+        for row in range(n):
+            i = row if row < half else row - n
+            for j in range(half + 1):
+                square = i * i + j * j
+                if square < long:
+                    continue
+                # A real signal's spectrum is symmetric: the half that is kept holds the column j = 0 whole.
+                total += power[row, j] if j else 0.5 * power[row, j]
+                if lowest <= square <= highest and power[row, j] > most:
+                    most, best_i, best_j = power[row, j], i, j
+        held = 0.0
+        for harmonic in range(1, harmonics + 1):
+            for a in range(-reach, reach + 1):
+                for b in range(-reach, reach + 1):
+                    i, j = harmonic * best_i + a, harmonic * best_j + b
+                    if j < 0:
+                        i, j = -i, -j
+                    if -half <= i < half and j <= half:
+                        held += power[i, j]
+        strength[k] = min(held / max(total, 1e-12), 1.0)
+        here = np.log(power[best_i, best_j] + 1e-12)
+        left = power[best_i, best_j - 1] if best_j else power[-best_i, 1]
+        right = power[best_i, min(best_j + 1, half)]
+        x[k] = (best_j + _vertex(np.log(left + 1e-12), here, np.log(right + 1e-12))) / unit
+        north, south = np.log(power[best_i - 1, best_j] + 1e-12), np.log(power[best_i + 1, best_j] + 1e-12)
+        y[k] = (best_i + _vertex(north, here, south)) / unit
+    return y, x, strength
 
 
-def _vertex(left: Values, middle: Values, right: Values) -> Values:
+@compiled
+def _vertex(left: float, middle: float, right: float) -> float:
     """Offset in (-0.5, 0.5) of the vertex of the parabola through three neighbours."""
     bend = left - 2 * middle + right
-    out: Values = np.clip(0.5 * (left - right) / np.where(np.abs(bend) < 1e-9, -1e9, bend), -0.5, 0.5)
-    return out
+    return float(min(max(0.5 * (left - right) / bend, -0.5), 0.5)) if abs(bend) > 1e-9 else 0.0
 
 
 def _axial_median(peaks: _Peaks) -> _Peaks:
@@ -255,16 +265,18 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
 
 def _spacing_beside(here: Values, chord: Values, row: NDArray[np.int64], expected: Values) -> Values:
     """Mean distance in metres (n,) from points of rows to the rows on both sides, NaN where there is none."""
-    tree = cKDTree(here)
+    if len(here) == 0:
+        return np.empty(0)
     way = chord / np.hypot(*chord.T)[:, None]
-    out = np.full(len(here), np.nan)
-    for i, near in enumerate(tree.query_ball_point(here, 1.8 * expected)):
-        other = np.array([j for j in near if row[j] != row[i]], dtype=np.int64)
-        offset = here[other] - here[i]
-        along, left = offset @ way[i], way[i, 0] * offset[:, 1] - way[i, 1] * offset[:, 0]
-        beside = np.abs(along) <= 0.75
-        sides = [np.abs(left[beside & (side * left > 0.3)]) for side in (1, -1)]
-        reached = [side.min() for side in sides if len(side)]
-        if reached:
-            out[i] = np.mean(reached)
-    return out
+    pairs = cKDTree(here).query_pairs(1.8 * float(expected.max()), output_type="ndarray")
+    pairs = pairs[row[pairs[:, 0]] != row[pairs[:, 1]]]
+    near, there = np.concatenate([pairs, pairs[:, ::-1]]).T
+    offset = here[there] - here[near]
+    along = (offset * way[near]).sum(axis=1)
+    left = way[near, 0] * offset[:, 1] - way[near, 1] * offset[:, 0]
+    beside = (np.abs(along) <= 0.75) & (np.abs(left) > 0.3) & (np.hypot(along, left) <= 1.8 * expected[near])
+    sides = np.full((2, len(here)), np.inf)
+    np.minimum.at(sides, ((left > 0).astype(int)[beside], near[beside]), np.abs(left[beside]))
+    reached = np.isfinite(sides)
+    n = reached.sum(axis=0)
+    return np.where(n > 0, np.where(reached, sides, 0).sum(axis=0) / np.maximum(n, 1), np.nan)

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import geopandas as gpd
 import numpy as np
 import shapely
+from scipy import sparse
 from scipy.ndimage import gaussian_filter
+from scipy.sparse.linalg import spsolve
 
 from vinemap.compiled import compiled
-from vinemap.raster import Raster, cell_of, sample
+from vinemap.raster import Raster, sample
 from vinemap.row_frame import (
     between,
     centre_line,
-    extend,
     half_width,
     normals,
     resample,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.cloud import PointCloud
+    from vinemap.raster import Grid
 
     Values = NDArray[np.floating]
 
@@ -42,7 +44,7 @@ CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
-COURSE = 12.0
+COURSE = 20.0
 """Wavelength in metres below which a course's bends are not trusted."""
 POINTS_A_METRE = 200.0
 """Canopy points in a metre of row for which the smoothing is meant."""
@@ -52,8 +54,6 @@ REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
-PASSES = 3
-"""Times that the centre line is drawn through an image that the last one has straightened."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
 
@@ -123,11 +123,9 @@ def fit_rows(
     half = half_width(courses["spacing_m"].to_numpy())
     fits: list[_Fit | None] = []
     for k, share in enumerate(_deal(cloud, heights, cover, curves, half, low, high)):
-        shift: Values = np.zeros(len(curves[k]))
         cutoff = smoothing / CELL * _noise_stretch(share, half[k])
-        for _ in range(PASSES):
-            image, offsets = _straighten(share, shift, half[k])
-            shift = centre_line(image, offsets, shift, reach=0.75 * half[k], cutoff=cutoff)
+        image, offsets = _straighten(share, np.zeros(share.n), half[k])
+        shift = centre_line(image, offsets, reach=0.75 * half[k], cutoff=cutoff)
         curve = curves[k] + shift[:, None] * normals(curves[k], smoothing=1 / CELL)
         fits.append(_ends(curve, _straighten(share, shift, half[k])[0], end_share))
     rows: list[tuple[object, ...]] = []
@@ -149,12 +147,16 @@ def fit_rows(
 
 def _smooth_course(course: Values) -> Values:
     """Course without the bends that the centre line is to find, carried on beyond its ends."""
-    curve = resample(extend(course, MARGIN), CELL)
-    way = way_along(curve)
-    known = ((way >= MARGIN) & (way <= way[-1] - MARGIN)).astype(float)
-    chord = np.linspace(curve[0], curve[-1], len(curve))
-    bend = [whittaker(values, known, cutoff=COURSE / CELL) for values in (curve - chord).T]
-    return resample(chord + np.column_stack(bend), CELL)
+    step = 5 * CELL
+    beyond = round(MARGIN / step)
+    known = np.pad(resample(course, step), [(beyond, beyond), (0, 0)])
+    weight = np.pad(np.ones(len(known) - 2 * beyond), beyond)
+    # Third differences: neither the smoothing nor what is carried on straightens an arc.
+    third = sparse.diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(len(known) - 3, len(known)))
+    penalty = (COURSE / step / (2 * np.pi)) ** 6 * (third.T @ third)
+    origin = course[0]
+    smooth = spsolve(sparse.csc_array(penalty + sparse.diags_array(weight)), weight[:, None] * (known - origin))
+    return resample(origin + smooth, CELL)
 
 
 def _deal(
@@ -164,15 +166,37 @@ def _deal(
     if not curves:
         return []
     near = row_coordinates(cloud.xyz, curves, half + REACH)
-    height = heights[near.member]
-    canopy = np.clip((height - low) / RAMP + 0.5, 0, 1) * np.clip((high - height) / RAMP + 0.5, 0, 1)
-    canopy *= cover.values.ravel()[cell_of(cloud.xyz[near.member], cover.grid)] > 0
+    vines = cover.values > 0
+    canopy = _canopy(cloud.xyz, heights, near.member, vines, cover.grid, low, high, RAMP)
     shares = []
     for k, curve in enumerate(curves):
         mine = slice(near.start[k], near.start[k + 1])
         station = near.along[mine] * ((len(curve) - 1) / way_along(curve)[-1])
         shares.append(_Share(station, near.left[mine], canopy[mine], len(curve)))
     return shares
+
+
+@compiled
+def _canopy(
+    xyz: Values,
+    heights: Values,
+    member: NDArray[np.int64],
+    vines: NDArray[np.bool_],
+    grid: Grid,
+    low: float,
+    high: float,
+    ramp: float,
+) -> Values:
+    """How far members (n,) of a cloud are canopy, 0 to 1: between two heights, and where there are vines."""
+    out = np.zeros(len(member))
+    for k in range(len(member)):
+        p = member[k]
+        j = min(max(int((xyz[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
+        i = min(max(int((grid.north - xyz[p, 1]) / grid.resolution), 0), grid.ny - 1)
+        if vines[i, j]:
+            rise = min(max((heights[p] - low) / ramp + 0.5, 0.0), 1.0)
+            out[k] = rise * min(max((high - heights[p]) / ramp + 0.5, 0.0), 1.0)
+    return out
 
 
 def _noise_stretch(share: _Share, half: float) -> float:

@@ -173,20 +173,17 @@ def between(curve: Values, start: float, end: float) -> Values:
     return at(curve, np.concatenate([[start], way[(way > start) & (way < end)], [end]]))
 
 
-def centre_line(image: Values, offsets: Values, shift: Values, *, reach: float, cutoff: float) -> Values:
+def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:
     """Offset in metres (n,) of the canopy's centre from a curve at each station of a straightened row.
 
-    Centroids above a background, within ``reach`` metres of the centre so far, smoothed robustly.
+    Centroids above a background, within ``reach`` metres of the smoothed centre so far, smoothed robustly.
 
     Parameters
     ----------
     image : (n, m) array
         Canopy cover at n stations and m cells across.
     offsets : (m,) array
-        The cells' metres to the left of the curve moved by ``shift``.
-    shift : (n,) array
-        Metres by which the image has followed the canopy already. What is smoothed is the whole offset from the
-        curve: smoothing what is left, pass after pass, would smooth less and less.
+        The cells' metres to the left of the curve.
     reach : float
         Metres to both sides.
     cutoff : float
@@ -195,13 +192,13 @@ def centre_line(image: Values, offsets: Values, shift: Values, *, reach: float, 
     smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
     strength = np.quantile(smooth.max(axis=1), 0.7)
     excess = np.maximum(smooth - 0.25 * strength, 0)
-    centre = shift
+    centre: Values = np.zeros(len(image))
     for _ in range(4):
-        amount, moment = _centroids(excess, offsets, centre - shift, reach)
+        amount, moment = _centroids(excess, offsets, centre, reach)
         # Stations of a stray leaf or two tell nothing of the row's middle.
         typical = np.quantile(amount, 0.7)
         weight = amount * np.clip(2 * amount / max(typical, 1e-9) - 0.5, 0, 1)
-        measured = shift + moment / np.maximum(amount, 1e-9)
+        measured = moment / np.maximum(amount, 1e-9)
         robust = np.ones(len(image))
         for _ in range(3):
             trusted = weight * robust
