@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.raster import Raster, block_sum, cell_of, count, grid_over
+from vinemap.compiled import compiled
+from vinemap.raster import Raster, block_sum, cell_of, grid_over
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,16 +54,28 @@ def canopy_cover(
         of vines (huts, hedges, bushes) is left out.
     """
     grid = grid_over(cloud.xyz, resolution=resolution)
-    cells = cell_of(cloud.xyz, grid)
-    everything = count(cells, grid)
-    canopy = count(cells[(heights >= low) & (heights <= high)], grid)
-    density = len(cells) / max(1, int(np.count_nonzero(everything)))
+    limits = np.array([low, high, TALLEST])
+    counts = _count_layers(cell_of(cloud.xyz, grid), heights, limits, grid.ny * grid.nx).reshape(3, *grid.shape)
+    everything, canopy, tall = counts
+    density = len(heights) / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     blurred = gaussian_filter(everything, sigma)
     cover = gaussian_filter(canopy, sigma) / (blurred + 0.1 * density)
-    tall = count(cells[(heights > high) & (heights < TALLEST)], grid)
     cover[_no_vines(everything, canopy, tall, resolution)] = 0.0
     return Raster(cover, grid, cloud.crs)
+
+
+@compiled
+def _count_layers(cells: NDArray[np.int64], heights: Values, limits: Values, n: int) -> Values:
+    """Points of each cell (3, n): all, those between the first two limits, those between the last two."""
+    counts = np.zeros((3, n))
+    for p in range(len(cells)):
+        counts[0, cells[p]] += 1
+        if limits[0] <= heights[p] <= limits[1]:
+            counts[1, cells[p]] += 1
+        elif limits[1] < heights[p] < limits[2]:
+            counts[2, cells[p]] += 1
+    return counts
 
 
 def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: float) -> NDArray[np.bool_]:

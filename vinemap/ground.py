@@ -15,7 +15,7 @@ from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
 from vinemap.compiled import compiled
-from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, sample
+from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, height_above, sample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,7 +88,7 @@ def terrain_model(
     surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, crs)
     cell = cell_of(xyz, grid)
     for _ in range(2):
-        cells = _order_statistics(xyz[:, 2] - sample(surface, xyz), cell, grid, quantile)
+        cells = _order_statistics(height_above(surface, xyz), cell, grid, quantile)
         fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
         surface = Raster(surface.values + fitted, grid, crs)
         # On slopes and terraces that were new to it, soil is thin only once cells lie along them.
@@ -116,7 +116,7 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
 
 def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
     """Height in metres (n,) of every point above the terrain model."""
-    return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
+    return height_above(dtm, cloud.xyz)
 
 
 def canopy_height_model(cloud: PointCloud, heights: NDArray[np.floating], *, resolution: float = 0.25) -> Raster:

@@ -118,6 +118,11 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     return _bilinear(_columns(raster.values), raster.grid, flat).reshape(points.shape[:-1])
 
 
+def height_above(raster: Raster, xyz: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Metres (n,) by which points (n, 3) lie above a raster of elevations."""
+    return _heights(_columns(raster.values), raster.grid, _columns(xyz))
+
+
 def sample_across(
     raster: Raster, origin: NDArray[np.floating], normal: NDArray[np.floating], offsets: NDArray[np.floating]
 ) -> NDArray[np.float64]:
@@ -159,6 +164,14 @@ def _bilinear(values: NDArray[np.float64], grid: Grid, xy: NDArray[np.float64]) 
     out = np.empty(len(xy))
     for p in range(len(xy)):
         out[p] = _value(values, grid, xy[p, 0], xy[p, 1])
+    return out
+
+
+@compiled
+def _heights(values: NDArray[np.float64], grid: Grid, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    out = np.empty(len(xyz))
+    for p in range(len(xyz)):
+        out[p] = xyz[p, 2] - _value(values, grid, xyz[p, 0], xyz[p, 1])
     return out
 
 

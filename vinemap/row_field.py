@@ -29,6 +29,8 @@ FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
 COVER_RESOLUTION = 0.25
 """Cell size in metres of the cover whose spectrum is taken."""
+NEAR, LEAST_COVER = 2.5, 0.02
+"""Metres from canopy, and what cover is canopy, within which there may be rows."""
 PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
@@ -66,7 +68,7 @@ def estimate_row_field(
     Returns
     -------
     RowField
-        On a grid of 1 m over the cover's area. Likelihood is the share of the window's variance that the wave
+        On a grid of 0.5 m over the cover's area. Likelihood is the share of the window's variance that the wave
         and its harmonics carry; direction and spacing are NaN where it is zero.
     """
     base = _block_mean(cover, COVER_RESOLUTION)
@@ -102,7 +104,9 @@ def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) 
     windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
     hann = np.hanning(size + 1)[:-1]
     taper = (hann[:, None] * hann).astype(np.float32)
-    occupied = np.flatnonzero([w.any() for w in windows])
+    reach = 2 * round((NEAR + step) / COVER_RESOLUTION) + 1
+    canopy = np.pad(maximum_filter(cover, reach) > LEAST_COVER, [(0, 2 * stride)], mode="edge")
+    occupied = np.flatnonzero(canopy[::stride, ::stride][:my, :mx])
     out = np.zeros((3, len(windows)))
     out[:2] = np.nan
     for start in range(0, len(occupied), BATCH):
@@ -212,7 +216,8 @@ def _resample(peaks: _Peaks, grid: Grid, base: Grid, step: float, cover: Raster)
     direction = np.mod(np.degrees(np.angle(at(wave.real) + 1j * at(wave.imag)) / 2), 180)
     weight = at(strength**2)
     spacing = at(strength**2 * np.nan_to_num(peaks.spacing)) / np.maximum(weight, 1e-12)
-    near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, size=round(5 / FIELD_RESOLUTION) + 1) > 0.02
+    reach = 2 * round(NEAR / FIELD_RESOLUTION) + 1
+    near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, reach) > LEAST_COVER
     likelihood = np.where(near, at(strength), 0.0)
     known = weight > 1e-9
 

@@ -13,7 +13,7 @@ import geopandas as gpd
 import numpy as np
 import shapely
 from scipy import sparse
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.sparse.linalg import spsolve
 
 from vinemap.compiled import compiled
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
+AROUND = 0.3
+"""Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
 COURSE = 20.0
@@ -85,7 +87,7 @@ def fit_rows(
     low: float = 0.5,
     high: float = 2.9,
     smoothing: float = 2.5,
-    end_share: float = 0.5,
+    end_share: float = 0.58,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Fit the rows' curves to the points of their canopies.
@@ -108,7 +110,7 @@ def fit_rows(
         Wavelength in metres below which bends of the centre line are taken for noise, at 200 canopy points a metre of
         row; it grows with the fifth root of their distance.
     end_share : float
-        Share of the row's median cover at which its canopy begins and ends.
+        Share of the cover thereabouts at which a row's canopy begins and ends.
     min_gap : float
         Metres without canopy that make a gap.
 
@@ -245,7 +247,12 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
         return None
-    edge = end_share * float(np.median(present))
+    typical = float(np.median(present))
+    # The last vine may be a weak one: what counts is the cover thereabouts, where there is canopy at all.
+    living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
+    near, weight = (gaussian_filter1d(v, AROUND / CELL, mode="constant") for v in (profile * living, living))
+    profile *= typical / ((near + 0.1 * typical) / (weight + 0.1))
+    edge = end_share * typical
     # Thin canopies have holes: what a weaker trace joins is one run, from its first to its last full edge.
     weak = runs_above(profile, 0.5 * edge)
     full = runs_above(profile, edge)
@@ -254,10 +261,10 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     metres = metres[np.diff(metres, axis=1)[:, 0] >= SHORTEST]
     if len(metres) == 0:
         return None
-    living = image[profile > edge]
-    aside = max(1, living.shape[1] // 8)
-    beside = np.concatenate([living[:, :aside], living[:, -aside:]], axis=1).mean()
-    contrast = float(np.clip(1 - beside / living.max(axis=1).mean(), 0, 1))
+    canopy = image[profile > edge]
+    aside = max(1, canopy.shape[1] // 8)
+    beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
+    contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
     return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
 
 
