@@ -8,6 +8,8 @@ import shapely
 
 SETTLED = 5.0
 """Metres of row after which its length no longer speaks against it."""
+SLACK = 0.02
+"""Metres to which distances of rows are needed."""
 ODD_SPACING = 1.5
 """Ratio of a row's distance from its nearest neighbour to the block's, or its inverse, that is odd."""
 SHORT = 0.5
@@ -41,7 +43,8 @@ def judge_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         if len(index) < 3:
             continue
         mine = lines[index]
-        away = shapely.distance(mine[:, None], mine[None, :])
+        simple = shapely.simplify(mine, SLACK)
+        away = shapely.distance(simple[:, None], simple[None, :])
         np.fill_diagonal(away, np.inf)
         nearest = away.min(axis=1)
         ratio = nearest / np.median(nearest)

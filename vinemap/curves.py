@@ -159,10 +159,9 @@ def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
     # Key points zigzag; what is added to their course is smooth and would leave the zigzag in.
     even = np.ones(len(curve))
     curve = np.column_stack([whittaker(curve[:, k], even, cutoff=ZIGZAG / STATION) for k in (0, 1)])
-    for reach in (half, 0.75 * half):
-        image, offsets = _straighten(cover, curve, half)
-        shift = centre_line(image, offsets, reach=reach, cutoff=SMOOTHING / STATION)
-        curve = resample(curve + shift[:, None] * normals(curve, smoothing=1 / STATION), STATION)
+    image, offsets = _straighten(cover, curve, half)
+    shift = centre_line(image, offsets, reach=half, cutoff=SMOOTHING / STATION)
+    curve = resample(curve + shift[:, None] * normals(curve, smoothing=1 / STATION), STATION)
     image, offsets = _straighten(cover, curve, half)
     profile = image.sum(axis=1) * BIN
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
-from vinemap.compiled import compiled
-from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, height_above, sample
+from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, sample
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,7 +37,7 @@ FEW = 6.0
 """Points whose heights tell nothing of weeds."""
 SPIKE = 0.3
 """Metres by which a cell of the canopy height model may stand out."""
-NARROWEST = 3.0
+NARROWEST = 1.2
 """Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
 RIDGE = 0.02
 """Weight that holds a local plane to the coarser surface where cells are few."""
@@ -88,7 +88,7 @@ def terrain_model(
     surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, crs)
     cell = cell_of(xyz, grid)
     for _ in range(2):
-        cells = _order_statistics(height_above(surface, xyz), cell, grid, quantile)
+        cells = _order_statistics(xyz[:, 2] - sample(surface, xyz), cell, grid, quantile)
         fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
         surface = Raster(surface.values + fitted, grid, crs)
         # On slopes and terraces that were new to it, soil is thin only once cells lie along them.
@@ -116,7 +116,7 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
 
 def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
     """Height in metres (n,) of every point above the terrain model."""
-    return height_above(dtm, cloud.xyz)
+    return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
 
 
 def canopy_height_model(cloud: PointCloud, heights: NDArray[np.floating], *, resolution: float = 0.25) -> Raster:
@@ -172,8 +172,10 @@ def _trend(cells: _Cells) -> Values:
 
 def _order_statistics(heights: NDArray[np.floating], cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
     """Quantiles of heights in cells, by one sort."""
-    keys, n = _keys(heights, cells, grid.ny * grid.nx)
+    metres, keys = np.asarray(heights, dtype=np.float64), np.empty(len(cells), dtype=np.int64)
+    in_threads(lambda part: _fill_keys(*part, metres, cells, keys), stretches(len(keys)))
     keys.sort()
+    n = _count_keys(keys, grid.ny * grid.nx)
     first = np.cumsum(n) - n
 
     def at(q: float) -> Values:
@@ -185,14 +187,19 @@ def _order_statistics(heights: NDArray[np.floating], cells: NDArray[np.int64], g
 
 
 @compiled
-def _keys(heights: Values, cells: NDArray[np.int64], n_cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Integers (n,) that hold a point's cell above and its height below, and the points of each cell."""
-    keys, n = np.empty(len(cells), dtype=np.int64), np.zeros(n_cells, dtype=np.int64)
-    for p in range(len(cells)):
+def _fill_keys(first: int, last: int, heights: Values, cells: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
+    """Integers (n,) that hold a point's cell above and its height below."""
+    for p in range(first, last):
         step = min(max(int((heights[p] - LOWEST) / STEP), 0), MOST_STEPS)
         keys[p] = cells[p] << BITS | step
-        n[cells[p]] += 1
-    return keys, n
+
+
+@compiled
+def _count_keys(keys: NDArray[np.int64], n_cells: int) -> NDArray[np.int64]:
+    n = np.zeros(n_cells, dtype=np.int64)
+    for key in keys:
+        n[key >> BITS] += 1
+    return n
 
 
 def _depth(n: Values, quantile: float) -> Values:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from affine import Affine
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,9 +72,10 @@ def grid_over(xy: ArrayLike, *, resolution: float) -> Grid:
     InputError
         If it would have more than ``MAX_CELLS`` cells.
     """
-    x, y = np.asarray(xy)[:, 0], np.asarray(xy)[:, 1]
-    west, south = np.floor(x.min() / resolution) * resolution, np.floor(y.min() / resolution) * resolution
-    east, north = x.max(), y.max()
+    points = _columns(np.asarray(xy))
+    bounds = np.array(in_threads(lambda part: _bounds(*part, points), stretches(len(points))))
+    west, south = np.floor(bounds[:, :2].min(axis=0) / resolution) * resolution
+    east, north = bounds[:, 2:].max(axis=0)
     nx = int((east - west) // resolution) + 1
     ny = int(np.ceil((north - south) / resolution)) + 1
     if nx * ny > MAX_CELLS:
@@ -93,7 +94,10 @@ def coarser(grid: Grid, *, resolution: float) -> Grid:
 
 def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int64]:
     """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
-    return _cells(_columns(xy), grid)
+    points = _columns(xy)
+    out = np.empty(len(points), dtype=np.int64)
+    in_threads(lambda part: _cells(*part, points, grid, out), stretches(len(points)))
+    return out
 
 
 def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
@@ -106,8 +110,8 @@ def block_sum(values: NDArray[np.floating], k: int) -> NDArray[np.floating]:
     ny, nx = (-(-n // k) for n in values.shape)
     padded = np.zeros((ny * k, nx * k))
     padded[: values.shape[0], : values.shape[1]] = values
-    down = sum(padded[i::k] for i in range(k))
-    out: NDArray[np.floating] = sum(down[:, j::k] for j in range(k))
+    down = np.add.reduce([padded[i::k] for i in range(k)])
+    out: NDArray[np.floating] = np.add.reduce([down[:, j::k] for j in range(k)])
     return out
 
 
@@ -115,19 +119,19 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
     points = np.asarray(xy, dtype=float)
     flat = _columns(points.reshape(-1, points.shape[-1]))
-    return _bilinear(_columns(raster.values), raster.grid, flat).reshape(points.shape[:-1])
-
-
-def height_above(raster: Raster, xyz: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Metres (n,) by which points (n, 3) lie above a raster of elevations."""
-    return _heights(_columns(raster.values), raster.grid, _columns(xyz))
+    values, out = _columns(raster.values), np.empty(len(flat))
+    in_threads(lambda part: _bilinear(*part, values, raster.grid, flat, out), stretches(len(flat)))
+    return out.reshape(points.shape[:-1])
 
 
 def sample_across(
     raster: Raster, origin: NDArray[np.floating], normal: NDArray[np.floating], offsets: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Bilinear values (n, m) at offsets (m,) from origins (n, 2) along unit vectors (n, 2)."""
-    return _bilinear_across(_columns(raster.values), raster.grid, _columns(origin), _columns(normal), offsets)
+    values, starts, ways, at = (_columns(v) for v in (raster.values, origin, normal, offsets))
+    out = np.empty((len(origin), len(offsets)))
+    in_threads(lambda part: _bilinear_across(*part, values, raster.grid, starts, ways, at, out), stretches(len(origin)))
+    return out
 
 
 def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -136,13 +140,20 @@ def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 @compiled
-def _cells(xy: NDArray[np.float64], grid: Grid) -> NDArray[np.int64]:
-    out = np.empty(len(xy), dtype=np.int64)
-    for p in range(len(xy)):
+def _bounds(first: int, last: int, xy: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    west, south, east, north = np.inf, np.inf, -np.inf, -np.inf
+    for p in range(first, last):
+        west, south = min(west, xy[p, 0]), min(south, xy[p, 1])
+        east, north = max(east, xy[p, 0]), max(north, xy[p, 1])
+    return west, south, east, north
+
+
+@compiled
+def _cells(first: int, last: int, xy: NDArray[np.float64], grid: Grid, out: NDArray[np.int64]) -> None:
+    for p in range(first, last):
         j = min(max(int((xy[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
         i = min(max(int((grid.north - xy[p, 1]) / grid.resolution), 0), grid.ny - 1)
         out[p] = i * grid.nx + j
-    return out
 
 
 @compiled
@@ -160,35 +171,28 @@ def _value(values: NDArray[np.float64], grid: Grid, x: float, y: float) -> float
 
 
 @compiled
-def _bilinear(values: NDArray[np.float64], grid: Grid, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    out = np.empty(len(xy))
-    for p in range(len(xy)):
+def _bilinear(
+    first: int, last: int, values: NDArray[np.float64], grid: Grid, xy: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
+    for p in range(first, last):
         out[p] = _value(values, grid, xy[p, 0], xy[p, 1])
-    return out
-
-
-@compiled
-def _heights(values: NDArray[np.float64], grid: Grid, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    out = np.empty(len(xyz))
-    for p in range(len(xyz)):
-        out[p] = xyz[p, 2] - _value(values, grid, xyz[p, 0], xyz[p, 1])
-    return out
 
 
 @compiled
 def _bilinear_across(
+    first: int,
+    last: int,
     values: NDArray[np.float64],
     grid: Grid,
     origin: NDArray[np.float64],
     normal: NDArray[np.float64],
     offsets: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    out = np.empty((len(origin), len(offsets)))
-    for p in range(len(origin)):
+    out: NDArray[np.float64],
+) -> None:
+    for p in range(first, last):
         for k in range(len(offsets)):
             x, y = origin[p, 0] + offsets[k] * normal[p, 0], origin[p, 1] + offsets[k] * normal[p, 1]
             out[p, k] = _value(values, grid, x, y)
-    return out
 
 
 def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resampling: str = "average") -> None:

@@ -16,7 +16,7 @@ from scipy.fft import fft, rfft
 from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads
 from vinemap.raster import Grid, Raster, RowField, coarser
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
-BATCH = 512
+BATCH = 128
 
 
 class _Peaks(NamedTuple):
@@ -109,9 +109,11 @@ def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) 
     occupied = np.flatnonzero(canopy[::stride, ::stride][:my, :mx])
     out = np.zeros((3, len(windows)))
     out[:2] = np.nan
-    for start in range(0, len(occupied), BATCH):
-        batch = occupied[start : start + BATCH]
-        out[:, batch] = _strongest_wave(windows[batch], taper, band)
+    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
+    for batch, waves in zip(
+        batches, in_threads(lambda b: _strongest_wave(windows[b], taper, band), batches), strict=True
+    ):
+        out[:, batch] = waves
     return _Peaks(*out.reshape(3, my, mx))
 
 
@@ -120,8 +122,8 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     size = windows.shape[-1]
     wide = PADDING * size
     mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
-    rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2, workers=-1)
-    spectrum = fft(rows, n=wide, axis=1, workers=-1)
+    rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2)
+    spectrum = fft(rows, n=wide, axis=1)
     y, x, strength = _strongest(spectrum, COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
     direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
@@ -158,13 +160,7 @@ def _strongest(
                     most, best_i, best_j = power[row, j], i, j
         held = 0.0
         for harmonic in range(1, harmonics + 1):
-            for a in range(-reach, reach + 1):
-                for b in range(-reach, reach + 1):
-                    i, j = harmonic * best_i + a, harmonic * best_j + b
-                    if j < 0:
-                        i, j = -i, -j
-                    if -half <= i < half and j <= half:
-                        held += power[i, j]
+            held += _lobe(power, harmonic * best_i, harmonic * best_j, reach)
         strength[k] = min(held / max(total, 1e-12), 1.0)
         here = np.log(power[best_i, best_j] + 1e-12)
         left = power[best_i, best_j - 1] if best_j else power[-best_i, 1]
@@ -173,6 +169,21 @@ def _strongest(
         north, south = np.log(power[best_i - 1, best_j] + 1e-12), np.log(power[best_i + 1, best_j] + 1e-12)
         y[k] = (best_i + _vertex(north, here, south)) / unit
     return y, x, strength
+
+
+@compiled
+def _lobe(power: Values, middle_i: int, middle_j: int, reach: int) -> float:
+    """Power about one bin of a spectrum (n, n/2 + 1); none beyond the spectrum's edge."""
+    half = power.shape[1] - 1
+    held = 0.0
+    for a in range(-reach, reach + 1):
+        for b in range(-reach, reach + 1):
+            i, j = middle_i + a, middle_j + b
+            if j < 0:
+                i, j = -i, -j
+            if -half <= i < half and j <= half:
+                held += power[i, j]
+    return held
 
 
 @compiled
@@ -258,8 +269,10 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
 
     grid = field.direction.grid
     centres = np.stack(np.meshgrid(*grid.centres()), axis=-1)
-    distance, nearest = cKDTree(here).query(centres)
-    inside = distance <= 0.6 * rows["spacing_m"].to_numpy()[row][nearest]
+    reach = 0.6 * rows["spacing_m"].to_numpy()[row]
+    distance, nearest = cKDTree(here).query(centres, distance_upper_bound=reach.max() + 1e-6, workers=-1)
+    nearest[np.isinf(distance)] = 0
+    inside = distance <= reach[nearest]
     known = inside & np.isfinite(spacing)[nearest]
     return RowField(
         replace(field.direction, values=np.where(inside, direction[nearest], field.direction.values)),

@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.sparse.linalg import spsolve
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.raster import Raster, sample
 from vinemap.row_frame import (
     between,
@@ -27,7 +27,6 @@ from vinemap.row_frame import (
     row_coordinates,
     runs_above,
     way_along,
-    whittaker,
 )
 
 if TYPE_CHECKING:
@@ -123,13 +122,10 @@ def fit_rows(
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
-    fits: list[_Fit | None] = []
-    for k, share in enumerate(_deal(cloud, heights, cover, curves, half, low, high)):
-        cutoff = smoothing / CELL * _noise_stretch(share, half[k])
-        image, offsets = _straighten(share, np.zeros(share.n), half[k])
-        shift = centre_line(image, offsets, reach=0.75 * half[k], cutoff=cutoff)
-        curve = curves[k] + shift[:, None] * normals(curves[k], smoothing=1 / CELL)
-        fits.append(_ends(curve, _straighten(share, shift, half[k])[0], end_share))
+    shares = _deal(cloud, heights, cover, curves, half, low, high)
+    fits = in_threads(
+        lambda one: _fit(*one, smoothing=smoothing, end_share=end_share), list(zip(curves, shares, half, strict=True))
+    )
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
     for fit, spacing in zip(fits, courses["spacing_m"], strict=True):
@@ -145,6 +141,16 @@ def fit_rows(
         _frame(rows, ["spacing_m", "gap_m", "support", "contrast"], cover),
         _frame(gaps, ["row", "start_m", "end_m", "length_m"], cover),
     )
+
+
+def _fit(curve: Values, share: _Share, half: float, *, smoothing: float, end_share: float) -> _Fit | None:
+    """Centre line of a row about its course (n, 2), between the ends of its canopy."""
+    still = np.zeros(share.n)
+    image, offsets = _straighten(share, still, half)
+    cutoff = smoothing / CELL * _noise_stretch(share, half)
+    shift = centre_line(image, offsets, reach=0.75 * half, cutoff=cutoff)
+    centred = curve + shift[:, None] * normals(curve, smoothing=1 / CELL)
+    return _ends(centred, _straighten(share, shift, half)[0], end_share)
 
 
 def _smooth_course(course: Values) -> Values:
@@ -169,7 +175,11 @@ def _deal(
         return []
     near = row_coordinates(cloud.xyz, curves, half + REACH)
     vines = cover.values > 0
-    canopy = _canopy(cloud.xyz, heights, near.member, vines, cover.grid, low, high, RAMP)
+    canopy = np.zeros(len(near.member))
+    in_threads(
+        lambda part: _weigh(*part, cloud.xyz, heights, near.member, vines, cover.grid, (low, high), canopy),
+        stretches(len(canopy)),
+    )
     shares = []
     for k, curve in enumerate(curves):
         mine = slice(near.start[k], near.start[k + 1])
@@ -179,26 +189,26 @@ def _deal(
 
 
 @compiled
-def _canopy(
+def _weigh(
+    first: int,
+    last: int,
     xyz: Values,
     heights: Values,
     member: NDArray[np.int64],
     vines: NDArray[np.bool_],
     grid: Grid,
-    low: float,
-    high: float,
-    ramp: float,
-) -> Values:
+    limits: tuple[float, float],
+    canopy: Values,
+) -> None:
     """How far members (n,) of a cloud are canopy, 0 to 1: between two heights, and where there are vines."""
-    out = np.zeros(len(member))
-    for k in range(len(member)):
+    low, high = limits
+    for k in range(first, last):
         p = member[k]
         j = min(max(int((xyz[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
         i = min(max(int((grid.north - xyz[p, 1]) / grid.resolution), 0), grid.ny - 1)
         if vines[i, j]:
-            rise = min(max((heights[p] - low) / ramp + 0.5, 0.0), 1.0)
-            out[k] = rise * min(max((high - heights[p]) / ramp + 0.5, 0.0), 1.0)
-    return out
+            rise = min(max((heights[p] - low) / RAMP + 0.5, 0.0), 1.0)
+            canopy[k] = rise * min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
 
 
 def _noise_stretch(share: _Share, half: float) -> float:
@@ -210,7 +220,7 @@ def _noise_stretch(share: _Share, half: float) -> float:
 def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
     m = int(np.ceil(half / CELL))
-    leaves, everything = _spread(share.station, share.left, share.canopy, shift, m, CELL)
+    leaves, everything = _spread(share.station, share.left, share.canopy, shift, m)
     density = max(float(everything.mean()), 1e-9)
     sigma = max(1.0, density**-0.5)
     image = gaussian_filter(leaves, sigma) / (gaussian_filter(everything, sigma) + 0.1 * density)
@@ -218,9 +228,7 @@ def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Valu
 
 
 @compiled
-def _spread(
-    station: Values, left: Values, canopy: Values, shift: Values, m: int, cell: float
-) -> tuple[Values, Values]:
+def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int) -> tuple[Values, Values]:
     """Canopy and points (stations, 2 m + 1) in cells; each point is shared by the four whose centres surround it."""
     n = len(shift)
     leaves, everything = np.zeros((n, 2 * m + 1)), np.zeros((n, 2 * m + 1))
@@ -229,7 +237,7 @@ def _spread(
             continue
         i = int(station[p])
         down = station[p] - i
-        across = (left[p] - shift[i] * (1 - down) - shift[i + 1] * down) / cell + m
+        across = (left[p] - shift[i] * (1 - down) - shift[i + 1] * down) / CELL + m
         j = int(np.floor(across))
         right = across - j
         for b in range(2):

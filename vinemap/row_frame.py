@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.raster import grid_over
 
 if TYPE_CHECKING:
@@ -28,11 +28,10 @@ GUIDE = 0.25
 
 
 class RowCoordinates(NamedTuple):
-    """Points near rows, in the frame of the nearest one: row by row, those of row k from ``start[k]`` to
-    ``start[k + 1]``."""
+    """Points near rows in the frame of the nearest one, row by row."""
 
     start: NDArray[np.int64]
-    """First point (rows + 1,) of each row."""
+    """First point (rows + 1,) of each row; ``start[k + 1]`` is past its last."""
     along: Values
     """Metres (n,) along the row; negative before its start."""
     left: Values
@@ -63,7 +62,10 @@ def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> Row
     widest = float(reach.max()) + GUIDE
     grid = grid_over(np.concatenate([guides.xy - widest, guides.xy + widest]), resolution=GUIDE)
     nearest = _nearest_guides(guides.xy, grid, widest)
-    return RowCoordinates(*_refer(np.ascontiguousarray(xyz), grid, nearest, guides, reach.astype(float)))
+    points, within = np.ascontiguousarray(xyz), reach.astype(float)
+    guide = np.empty(len(points), dtype=np.int32)
+    in_threads(lambda part: _find_guides(*part, points, grid, nearest, guides, within, guide), stretches(len(guide)))
+    return RowCoordinates(*_refer(points, guide, guides, len(curves)))
 
 
 @compiled
@@ -87,13 +89,18 @@ def _nearest_guides(xy: Values, grid: Grid, reach: float) -> NDArray[np.int64]:
 
 
 @compiled
-def _refer(
-    xyz: Values, grid: Grid, nearest: NDArray[np.int64], guides: _Guides, reach: Values
-) -> tuple[NDArray[np.int64], Values, Values, NDArray[np.int64]]:
-    """Start, along, left and member of the points (n, ≥2) near the guides."""
-    guide = np.empty(len(xyz), dtype=np.int32)
-    start = np.zeros(len(reach) + 1, dtype=np.int64)
-    for p in range(len(xyz)):
+def _find_guides(
+    first: int,
+    last: int,
+    xyz: Values,
+    grid: Grid,
+    nearest: NDArray[np.int64],
+    guides: _Guides,
+    reach: Values,
+    guide: NDArray[np.int32],
+) -> None:
+    """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach."""
+    for p in range(first, last):
         guide[p] = -1
         j, i = (xyz[p, 0] - grid.west) / grid.resolution, (grid.north - xyz[p, 1]) / grid.resolution
         if j < 0 or i < 0 or j >= grid.nx or i >= grid.ny:
@@ -104,12 +111,22 @@ def _refer(
         x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
         if abs(guides.tangent[g, 0] * y - guides.tangent[g, 1] * x) <= reach[guides.row[g]]:
             guide[p] = g
+
+
+@compiled
+def _refer(
+    xyz: Values, guide: NDArray[np.int32], guides: _Guides, rows: int
+) -> tuple[NDArray[np.int64], Values, Values, NDArray[np.int64]]:
+    """Start, along, left and member of the points (n, ≥2) that have a guide."""
+    start = np.zeros(rows + 1, dtype=np.int64)
+    for g in guide:
+        if g >= 0:
             start[guides.row[g] + 1] += 1
     start = np.cumsum(start)
     along, left = np.empty(start[-1]), np.empty(start[-1])
     member = np.empty(start[-1], dtype=np.int64)
     place = start.copy()
-    for p in range(len(xyz)):
+    for p in range(len(guide)):
         g = guide[p]
         if g >= 0:
             x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
@@ -196,7 +213,7 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
     for _ in range(4):
         amount, moment = _centroids(excess, offsets, centre, reach)
         # Stations of a stray leaf or two tell nothing of the row's middle.
-        typical = np.quantile(amount, 0.7)
+        typical = float(np.quantile(amount, 0.7))
         weight = amount * np.clip(2 * amount / max(typical, 1e-9) - 0.5, 0, 1)
         measured = moment / np.maximum(amount, 1e-9)
         robust = np.ones(len(image))
@@ -233,56 +250,50 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 
     """
     if len(values) < 3:
         return values
-    return _penalised(
-        np.asarray(values, dtype=float),
-        np.asarray(weights, dtype=float),
-        (cutoff / (2 * np.pi)) ** 4,
-        (slope / (2 * np.pi)) ** 2,
-        max(ridge, 1e-9),
+    bands = _penalties(
+        np.asarray(weights, dtype=float), (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2, max(ridge, 1e-9)
     )
+    return _solve(bands, np.asarray(weights * values, dtype=float))
 
 
 @compiled
-def _penalised(values: Values, weights: Values, second: float, first: float, ridge: float) -> Values:
-    """Minimise Σ w (x − v)² + level (second Σ (Δ²x)² + first Σ (Δx)² + ridge Σ x² between what has weights)."""
-    n = len(values)
+def _penalties(weights: Values, second: float, first: float, ridge: float) -> Values:
+    """Diagonal and both bands (n, 3) of what minimises Σ w (x − v)² + penalties on Δ²x, Δx, and x in gaps."""
+    n = len(weights)
     level = weights.mean()
     if level == 0:
         level = 1.0
-    first_held, last_held = n, -1
+    held = np.flatnonzero(weights >= 0.1 * level)
+    gap_first, gap_last = (held[0], held[-1]) if len(held) else (n, -1)
+    bands = np.zeros((n, 3))
     for i in range(n):
-        if weights[i] >= 0.1 * level:
-            first_held, last_held = min(first_held, i), i
-    # Of L D Lᵀ, the factors of the symmetric matrix with two bands, D and both bands of L.
-    d, one, two = np.empty(n), np.zeros(n), np.zeros(n)
-    x = np.empty(n)
+        left, inner, right = i > 1, 0 < i < n - 1, i < n - 2
+        in_gap = gap_first < i < gap_last and weights[i] < 0.1 * level
+        bands[i, 0] = weights[i] + level * (
+            second * (left + 4 * inner + right) + first * ((i > 0) + (i < n - 1)) + (ridge if in_gap else 1e-9)
+        )
+        bands[i, 1] = -level * (2 * second * (inner + right) + first * (i < n - 1))
+        bands[i, 2] = level * second * right
+    return bands
+
+
+@compiled
+def _solve(bands: Values, values: Values) -> Values:
+    """Solve a symmetric system (n, n) of diagonal and two bands (n, 3) by its factors L D Lᵀ."""
+    n = len(values)
+    x = values.copy()
     for i in range(n):
-        inner = second * level
-        diagonal = inner * ((i < n - 2) + 4 * (0 < i < n - 1) + (i > 1))
-        beside = inner * -2.0 * ((i < n - 2) + (0 < i < n - 1)) - first * level * (i < n - 1)
-        after = inner * (i < n - 2)
-        diagonal += first * level * ((i > 0) + (i < n - 1)) + weights[i]
-        between_held = first_held < i < last_held and weights[i] < 0.1 * level
-        diagonal += level * (ridge if between_held else 1e-9)
-        x[i] = weights[i] * values[i]
+        for k in range(1, min(i, 2) + 1):
+            x[i] -= bands[i - k, k] * x[i - k]
+            bands[i, 0] -= bands[i - k, 0] * bands[i - k, k] ** 2
         if i > 0:
-            beside -= d[i - 1] * one[i - 1] * two[i - 1]
-            diagonal -= d[i - 1] * one[i - 1] ** 2
-            x[i] -= one[i - 1] * x[i - 1]
-        if i > 1:
-            diagonal -= d[i - 2] * two[i - 2] ** 2
-            x[i] -= two[i - 2] * x[i - 2]
-        d[i] = diagonal
-        if i < n - 1:
-            one[i] = beside / diagonal
-        if i < n - 2:
-            two[i] = after / diagonal
+            bands[i, 1] -= bands[i - 1, 0] * bands[i - 1, 1] * bands[i - 1, 2]
+        bands[i, 1] /= bands[i, 0]
+        bands[i, 2] /= bands[i, 0]
     for i in range(n - 1, -1, -1):
-        x[i] /= d[i]
-        if i < n - 1:
-            x[i] -= one[i] * x[i + 1]
-        if i < n - 2:
-            x[i] -= two[i] * x[i + 2]
+        x[i] /= bands[i, 0]
+        for k in range(1, min(n - 1 - i, 2) + 1):
+            x[i] -= bands[i, k] * x[i + k]
     return x
 
 

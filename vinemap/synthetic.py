@@ -308,7 +308,9 @@ def _grow(
         top = vineyard.height * (1 + 0.03 * smooth(arc, arc) + 0.035 * vigour + 0.03 * fine[0]) + 0.4 * shoots[0]
         top = np.maximum(top - 0.2 * (top - bottom) * np.clip(1 - inside / 0.25, 0, 1), bottom + 0.2)
         half_width = vineyard.half_width * (1 + 0.08 * smooth(arc, -arc) + 0.1 * girth + 0.1 * fine[1])
-        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(np.clip(inside / (0.45 * vineyard.half_width), 0, 1))
+        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(
+            np.clip(inside / (0.45 * vineyard.half_width), 0, 1)
+        )
         half_width[inside <= 0] = -1.0
         thinning = np.linspace(0.5, 1.1, LAYERS)  # towards the shaded foot, of which little is ever matched
         leaves = vineyard.leafiness * thinning * rng.gamma(1.5, 1 / 1.5, (n, LAYERS))
