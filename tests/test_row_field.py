@@ -41,9 +41,19 @@ def test_direction_and_spacing_of_stripes(direction, spacing):
     assert field.likelihood.values[middle].min() > 0.4
 
 
-def test_nothing_is_no_vineyard():
+@pytest.mark.parametrize("direction", [0, 16, 90, 137])
+def test_cylinders_see_stripes_as_well(direction):
+    field = estimate_row_field(stripes(direction, 2.5, size=30.0), method="cylinders")
+    middle = (slice(16, -16), slice(16, -16))
+    assert axial(field.direction.values[middle], direction).max() < 3
+    assert np.abs(field.spacing.values[middle] / 2.5 - 1).max() < 0.05
+    assert field.likelihood.values[middle].min() > 0.4
+
+
+@pytest.mark.parametrize("method", ["spectrum", "cylinders"])
+def test_nothing_is_no_vineyard(method):
     cover = stripes(0, 2.5)
-    field = estimate_row_field(Raster(np.zeros_like(cover.values), cover.grid, UTM))
+    field = estimate_row_field(Raster(np.zeros_like(cover.values), cover.grid, UTM), method=method)
     assert np.isnan(field.direction.values).all()
     assert field.likelihood.values.max() == 0
 

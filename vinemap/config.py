@@ -58,7 +58,9 @@ class CoverOptions(Options):
 class RowFieldOptions(Options):
     """Direction, spacing and likelihood of rows."""
 
+    method: Literal["spectrum", "cylinders"] = Field("spectrum", description="ours, or the thesis's cylinders")
     window: float = Field(16.0, ge=6, le=60, description="width of the spectrum's windows (m)")
+    radius: float = Field(5.0, ge=2, le=30, description="radius of the cylinders (m)")
     step: float = Field(2.0, ge=0.5, le=20, description="distance of the windows (m)")
     min_spacing: float = Field(1.2, ge=0.8, le=10, description="smallest inter-row spacing (m)")
     max_spacing: float = Field(4.5, ge=0.8, le=10, description="largest inter-row spacing (m)")
@@ -67,6 +69,8 @@ class RowFieldOptions(Options):
     def _ordered(self) -> RowFieldOptions:
         if self.min_spacing >= self.max_spacing:
             raise ValueError(f"min_spacing ({self.min_spacing}) must be below max_spacing ({self.max_spacing})")
+        if self.method == "cylinders" and self.radius <= self.max_spacing:
+            raise ValueError(f"radius ({self.radius}) must be above max_spacing ({self.max_spacing})")
         if self.window < 3 * self.max_spacing:
             raise ValueError(f"window ({self.window}) must hold three times max_spacing ({self.max_spacing})")
         return self

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import fft, rfft
+from scipy import sparse
+from scipy.fft import fft, irfft, rfft
 from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
@@ -20,6 +21,8 @@ from vinemap.compiled import compiled, in_threads
 from vinemap.raster import Grid, Raster, RowField, coarser
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -35,6 +38,8 @@ PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
+CYLINDER_TURN = 1.0
+"""Degrees between the directions in which a cylinder is sliced."""
 BATCH = 128
 
 
@@ -49,7 +54,9 @@ class _Peaks(NamedTuple):
 def estimate_row_field(
     cover: Raster,
     *,
+    method: str = "spectrum",
     window: float = 16.0,
+    radius: float = 5.0,
     step: float = 2.0,
     min_spacing: float = 1.2,
     max_spacing: float = 4.5,
@@ -60,8 +67,10 @@ def estimate_row_field(
     ----------
     cover : Raster
         Canopy cover 0–1.
-    window, step : float
-        Width of the square windows and their distance, in metres.
+    method : str
+        "spectrum" as described above, or the thesis's "cylinders", for comparison.
+    window, radius, step : float
+        Width of the square windows of the spectrum, radius of the cylinders, and the distance of both, in metres.
     min_spacing, max_spacing : float
         Band of inter-row spacings in metres in which the peak is sought.
 
@@ -72,7 +81,9 @@ def estimate_row_field(
         and its harmonics carry; direction and spacing are NaN where it is zero.
     """
     base = _block_mean(cover, COVER_RESOLUTION)
-    peaks = _scan(base.values, window, step, (min_spacing, max_spacing))
+    band = (min_spacing, max_spacing)
+    scan, size = (_scan_cylinders, radius) if method == "cylinders" else (_scan_spectrum, window)
+    peaks = scan(base.values, size, step, band)
     peaks = _axial_median(peaks)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
@@ -92,29 +103,78 @@ def _block_mean(raster: Raster, resolution: float) -> Raster:
     return Raster((total / np.maximum(n, 1)).reshape(grid.shape), grid, raster.crs)
 
 
-def _scan(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
+def _scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
     """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
-    size = 2 * round(window / COVER_RESOLUTION / 2)
+    windows, occupied, shape = _windows(cover, round(window / COVER_RESOLUTION / 2), step)
+    hann = np.hanning(windows.shape[-1] + 1)[:-1]
+    taper = (hann[:, None] * hann).astype(np.float32)
+    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
+    waves = in_threads(lambda batch: _strongest_wave(windows[batch], taper, band), batches)
+    return _peaks(waves, occupied, shape)
+
+
+def _scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> _Peaks:
+    """Direction across which the histogram of the cover in a cylinder varies most, and the period of that histogram.
+
+    The thesis scans cylinders so (section 2.3.1); its test, of Comba et al. (2015), is taken as the histogram's
+    variance, and the likelihood as its autocorrelation at one period.
+    """
+    half = int(np.ceil(radius / COVER_RESOLUTION))
+    windows, occupied, shape = _windows(cover, half, step)
+    i, j = np.mgrid[-half:half, -half:half] + 0.5
+    inside = np.hypot(i, j) * COVER_RESOLUTION <= radius
+    # Rasters count rows southwards.
+    x, y = j[inside] * COVER_RESOLUTION, -i[inside] * COVER_RESOLUTION
+    angles = np.radians(np.arange(0, 180, CYLINDER_TURN))
+    across = y * np.cos(angles)[:, None] - x * np.sin(angles)[:, None]
+    n = 2 * half
+    bins = np.clip(np.floor(across / COVER_RESOLUTION).astype(np.int64) + half, 0, n - 1)
+    bins += n * np.arange(len(angles))[:, None]
+    flat = (np.ones(bins.size), (bins.ravel(), np.tile(np.arange(len(x)), len(angles))))
+    sums = sparse.csr_array(flat, shape=(n * len(angles), len(x)))
+    size = np.maximum(sums.sum(axis=1).reshape(len(angles), n), 1.0)
+
+    def waves(batch: NDArray[np.int64]) -> Values:
+        k = np.arange(len(batch))
+        histogram = (sums @ windows[batch][:, inside].T).T.reshape(len(batch), len(angles), n) / size
+        histogram -= np.average(histogram, axis=2, weights=np.broadcast_to(size, histogram.shape))[:, :, None]
+        best = (histogram**2 * size).sum(axis=2).argmax(axis=1)
+        profile = histogram[k, best] * np.sqrt(size[best] / size.max())
+        power = np.abs(rfft(profile, n=2 * n, axis=1)) ** 2
+        similar = irfft(power, axis=1)[:, :n] / np.maximum(power.mean(axis=1), 1e-12)[:, None]
+        similar /= np.maximum(similar[:, :1], 1e-12)
+        low, high = (round(spacing / COVER_RESOLUTION) for spacing in band)
+        lag = low + similar[:, low : high + 1].argmax(axis=1)
+        around = [similar[k, lag + d] for d in (-1, 0, 1)]
+        period = [lag[m] + _vertex(*(v[m] for v in around)) for m in k]
+        return np.stack([angles[best], np.array(period) * COVER_RESOLUTION, np.clip(around[1], 0, 1)])
+
+    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
+    return _peaks([waves(batch) for batch in batches], occupied, shape)
+
+
+def _windows(cover: Values, half: int, step: float) -> tuple[Values, NDArray[np.int64], tuple[int, int]]:
+    """Windows (nodes, 2 half, 2 half) on a grid of nodes (my, mx) from the raster's corner, which are near canopy."""
+    size = 2 * half
     stride = max(1, round(step / COVER_RESOLUTION))
     # Windows reach over the edge by half their width; what lies there is no canopy.
     my, mx = (n // stride + 2 for n in cover.shape)
     padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)
-    half = size // 2
-    padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover
+    padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover[
+        : padded.shape[0] - half, : padded.shape[1] - half
+    ]
     windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
-    hann = np.hanning(size + 1)[:-1]
-    taper = (hann[:, None] * hann).astype(np.float32)
     reach = 2 * round((NEAR + step) / COVER_RESOLUTION) + 1
     canopy = np.pad(maximum_filter(cover, reach) > LEAST_COVER, [(0, 2 * stride)], mode="edge")
-    occupied = np.flatnonzero(canopy[::stride, ::stride][:my, :mx])
-    out = np.zeros((3, len(windows)))
+    return windows, np.flatnonzero(canopy[::stride, ::stride][:my, :mx]), (my, mx)
+
+
+def _peaks(waves: Sequence[Values], occupied: NDArray[np.int64], shape: tuple[int, int]) -> _Peaks:
+    out = np.zeros((3, shape[0] * shape[1]))
     out[:2] = np.nan
-    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    for batch, waves in zip(
-        batches, in_threads(lambda b: _strongest_wave(windows[b], taper, band), batches), strict=True
-    ):
-        out[:, batch] = waves
-    return _Peaks(*out.reshape(3, my, mx))
+    if waves:
+        out[:, occupied] = np.concatenate(waves, axis=1)
+    return _Peaks(*out.reshape(3, *shape))
 
 
 def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
