@@ -28,7 +28,7 @@ def reference(local, cloud):
 
 
 def assert_same(found, reference):
-    """Curves within 1 cm, ends within 1.5 cm; rows may be numbered and run the other way."""
+    """Curves and ends within 1 cm; rows may be numbered and run the other way."""
     assert len(found) == len(reference)
     for curve in reference:
         line = shapely.LineString(curve)
@@ -36,7 +36,7 @@ def assert_same(found, reference):
         ends = (
             other[[0, -1]] if np.hypot(*(other[0] - curve[0])) < np.hypot(*(other[-1] - curve[0])) else other[[-1, 0]]
         )
-        assert np.hypot(*(ends - curve[[0, -1]]).T).max() < 0.015
+        assert np.hypot(*(ends - curve[[0, -1]]).T).max() < 0.01
         between = shapely.get_coordinates(shapely.segmentize(shapely.LineString(other), 0.25))[2:-2]
         assert shapely.distance(line, shapely.points(between)).max() < 0.01
 

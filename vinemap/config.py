@@ -113,7 +113,7 @@ class FitOptions(Options):
     """Centre lines, ends and gaps of rows."""
 
     smoothing: Metres = Field(2.5, description="wavelength below which bends are noise (m)")
-    end_share: float = Field(0.58, gt=0, lt=1, description="share of the cover thereabouts at which canopy ends")
+    end_share: float = Field(0.6, gt=0, lt=1, description="share of the cover thereabouts at which canopy ends")
     min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
 
 

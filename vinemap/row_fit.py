@@ -86,7 +86,7 @@ def fit_rows(
     low: float = 0.5,
     high: float = 2.9,
     smoothing: float = 2.5,
-    end_share: float = 0.58,
+    end_share: float = 0.6,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Fit the rows' curves to the points of their canopies.
