@@ -28,7 +28,7 @@ STAGES = {
     "confidence",
     "missing",
 }
-STAGES |= {"sections", "canopy", "cgon", "odometry"}
+STAGES |= {"sections", "canopy", "cgon", "section_table", "odometry"}
 BESIDE = {"evaluate", "synthetic", "scenes"}
 SETTINGS = {"config", "paths"}
 CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS

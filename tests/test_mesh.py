@@ -3,6 +3,7 @@
 import builtins
 import json
 import struct
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -110,12 +111,93 @@ def rows():
     ]
 
 
-def read(path):
+def bumpy(sections, turn=1, **fields):
+    """A row of sections that all differ, a quarter of a metre apart, in a direction of its own."""
+    corners = along(LEANING[::turn], length=sections / 4, sections=sections)
+    corners[..., 1:] += np.random.default_rng(sections).uniform(-0.05, 0.05, corners.shape[:2] + (2,))
+    corners[..., 1] += 0.6 * (corners[..., 0] - ORIGIN[0])
+    return Mesh(*loft(corners), **fields)
+
+
+def chunks(path):
+    """The JSON of a GLB and its binary chunk."""
     data = path.read_bytes()
     magic, version, length = struct.unpack("<4sII", data[:12])
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size = struct.unpack("<I", data[12:16])[0]
-    return json.loads(data[20 : 20 + size], parse_constant=pytest.fail)
+    return json.loads(data[20 : 20 + size], parse_constant=pytest.fail), data[28 + size :]
+
+
+def read(path):
+    return chunks(path)[0]
+
+
+class Row(NamedTuple):
+    """A row's node as the file holds it."""
+
+    node: dict
+    mode: int
+    stored: np.ndarray
+    """(n, 3) positions, as numbers of the file."""
+    vertices: np.ndarray
+    """(n, 3) positions about the origin, z up, m."""
+    faces: np.ndarray
+    """(m, 3) triangles that have three vertices."""
+
+
+def decode(path):
+    """The rows of a GLB that have a mesh, read as the specification says."""
+    document, binary = chunks(path)
+    kinds = {5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+
+    def array(index):
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        kind, width = np.dtype(kinds[accessor["componentType"]]), {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
+        start = view["byteOffset"] + accessor["byteOffset"]
+        stride = view.get("byteStride") or kind.itemsize * width
+        assert start % 4 == stride % 4 == 0 or width == 1
+        assert accessor["byteOffset"] + stride * accessor["count"] <= view["byteLength"]
+        assert not accessor.get("normalized")
+        whole = np.frombuffer(binary, np.uint8, stride * accessor["count"], start).reshape(-1, stride)
+        values = np.ascontiguousarray(whole[:, : kind.itemsize * width]).view(kind)
+        if width == 3:
+            assert accessor["min"] == values.min(axis=0).tolist()
+            assert accessor["max"] == values.max(axis=0).tolist()
+        return values
+
+    rows = []
+    for node in document["nodes"]:
+        if "mesh" not in node:
+            continue
+        (primitive,) = document["meshes"][node["mesh"]]["primitives"]
+        stored, order = array(primitive["attributes"]["POSITION"]), array(primitive["indices"]).ravel().astype(int)
+        if primitive["mode"] == 5:
+            faces = np.lib.stride_tricks.sliding_window_view(order, 3).copy()
+            faces[1::2] = faces[1::2, ::-1]
+        else:
+            faces = order.reshape(-1, 3)
+        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        vertices = stored * np.array(node.get("scale", [1, 1, 1])) + node["translation"]
+        rows.append(Row(node, primitive["mode"], stored, vertices, faces))
+    return rows
+
+
+def oriented(faces):
+    """Triangles as sorted tuples, each begun at its lowest vertex."""
+    return sorted(tuple(np.roll(face, -np.argmin(face)).tolist()) for face in faces)
+
+
+def loaded(path):
+    """Name and shape of each row as trimesh places it, without the strips' triangles of repeated vertices."""
+    scene = trimesh.load(path)
+    for label in scene.graph.nodes_geometry:
+        transform, name = scene.graph[label]
+        shape = scene.geometry[name].copy()
+        shape.apply_transform(transform)
+        shape.update_faces((shape.faces != np.roll(shape.faces, 1, axis=1)).all(axis=1))
+        shape.merge_vertices()
+        yield label, shape
 
 
 def test_glb_has_a_node_a_row_with_its_numbers(tmp_path):
@@ -131,19 +213,111 @@ def test_glb_has_a_node_a_row_with_its_numbers(tmp_path):
     assert [m["doubleSided"] for m in document["materials"]] == [False]
 
 
-def test_glb_reads_back_in_metres_y_up(tmp_path):
+@pytest.mark.parametrize("plain", [False, True])
+def test_glb_reads_back_in_metres_y_up(tmp_path, plain):
     path = tmp_path / "F_canopy.glb"
-    write_glb(rows(), path, origin=ORIGIN, crs="EPSG:32632")
-    scene = trimesh.load(path)
-    assert set(scene.graph.nodes_geometry) == {"1 F", "2 F"}
-    for row in rows()[:2]:
-        transform, name = scene.graph[row.label]
-        shape = scene.geometry[name].copy()
-        shape.apply_transform(transform)
+    meshes = [*rows(), bumpy(100, turn=1, row_id=4, label="4 F"), bumpy(100, turn=-1, row_id=5, label="5 F")]
+    write_glb(meshes, path, origin=ORIGIN, crs="EPSG:32632", plain=plain)
+    shapes = dict(loaded(path))
+    assert set(shapes) == {"1 F", "2 F", "4 F", "5 F"}
+    for row in meshes:
+        if row.label not in shapes:
+            continue
+        shape = shapes[row.label]
         assert shape.is_watertight
-        assert shape.volume == pytest.approx(volume(row), rel=1e-5)
+        assert shape.is_winding_consistent
+        assert shape.volume == pytest.approx(volume(row), rel=1e-5 if plain else 0.01)
         expected = trimesh.transform_points(row.vertices - ORIGIN, TURN)
-        np.testing.assert_allclose(shape.bounds, [expected.min(axis=0), expected.max(axis=0)], atol=1e-5)
+        tolerance = 1e-5 if plain else 0.001
+        np.testing.assert_allclose(shape.bounds, [expected.min(axis=0), expected.max(axis=0)], atol=tolerance)
+
+
+def test_trimesh_drops_the_strips_triangles_without_area_itself(tmp_path):
+    path = tmp_path / "F_canopy.glb"
+    write_glb([bumpy(100)], path, origin=ORIGIN, crs="EPSG:32632")
+    (shape,) = trimesh.load(path, validate=True).geometry.values()
+    assert shape.is_watertight
+    assert len(shape.faces) == len(bumpy(100).faces)
+
+
+def test_positions_are_whole_steps_that_the_node_scales(tmp_path):
+    meshes = [*rows()[:2], bumpy(480, turn=-1)]
+    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    document = read(tmp_path / "a.glb")
+    assert document["extensionsUsed"] == document["extensionsRequired"] == ["KHR_mesh_quantization"]
+    assert document["bufferViews"][0]["byteStride"] == 8
+    for row, mesh in zip(decode(tmp_path / "a.glb"), meshes, strict=True):
+        (step,) = set(row.node["scale"])
+        assert step == pytest.approx(np.ptp(mesh.vertices, axis=0).max() / 65534, rel=1e-6)
+        assert row.stored.dtype == np.int16
+        assert np.abs(row.stored.astype(int)).max() == 32767
+        # Half a step along each axis, and what float64 loses at northings of 4650 km.
+        assert np.abs(row.vertices - (mesh.vertices - ORIGIN)).max() <= step / 2 + 2e-9
+
+
+def test_vertices_in_one_place_are_written(tmp_path):
+    mesh = Mesh(np.broadcast_to(ORIGIN, (10, 3)), loft(along(SQUARE, sections=2))[1])
+    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    assert not decode(tmp_path / "a.glb")[0].vertices.any()
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+@pytest.mark.parametrize("profile", [SQUARE, NOTCHED, LEANING])
+@pytest.mark.parametrize("lengths", [(9,), (2, 40), (40, 2, 2, 30), (12, 11, 10)])
+def test_a_strip_draws_the_faces(tmp_path, lengths, profile, turn):
+    pieces = [loft(along(profile[::turn], sections=k, shift=(20 * i, 0, 0))) for i, k in enumerate(lengths)]
+    mesh = Mesh(*merge(pieces))
+    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    (row,) = decode(tmp_path / "a.glb")
+    assert row.mode == 5
+    assert oriented(row.faces) == oriented(mesh.faces)
+
+
+def test_a_strip_takes_pieces_of_any_profile_and_turn(tmp_path):
+    pieces = [loft(along(p, sections=20)) for p in (SQUARE, LEANING[::-1], NOTCHED[::-1], [[0, 0], [1, 0], [0, 1]])]
+    mesh = Mesh(*merge(pieces))
+    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    (row,) = decode(tmp_path / "a.glb")
+    assert row.mode == 5
+    assert oriented(row.faces) == oriented(mesh.faces)
+
+
+def test_faces_of_any_order_are_written(tmp_path):
+    whole = bumpy(100)
+    sphere = trimesh.creation.icosphere()
+    orders = {
+        5: [np.concatenate([whole.faces, sphere.faces[:40] + 99]), np.delete(whole.faces, -3, axis=0)],
+        4: [whole.faces[1:], np.random.default_rng(0).permutation(whole.faces), sphere.faces, whole.faces[:3]],
+    }
+    for mode, meshes in orders.items():
+        for faces in meshes:
+            write_glb([Mesh(whole.vertices, faces)], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+            (row,) = decode(tmp_path / "a.glb")
+            assert row.mode == mode
+            assert oriented(row.faces) == oriented(faces)
+
+
+def test_a_section_takes_half_the_bytes_of_plain_lists(tmp_path):
+    size = {}
+    for k in (480, 960):
+        for plain in (False, True):
+            write_glb([bumpy(k)], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632", plain=plain)
+            size[k, plain] = (tmp_path / "a.glb").stat().st_size
+    assert (size[960, False] - size[480, False]) / 480 == pytest.approx(84, abs=0.1)
+    assert (size[960, True] - size[480, True]) / 480 == pytest.approx(168, abs=0.1)
+    assert size[480, False] < 88 * 480
+
+
+def test_plain_is_float32_and_lists_without_extensions(tmp_path):
+    meshes = [*rows()[:2], bumpy(100)]
+    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632", plain=True)
+    document = read(tmp_path / "a.glb")
+    assert not any(key.startswith("extensions") for key in document)
+    assert document["bufferViews"][0]["byteStride"] == 12
+    for row, mesh in zip(decode(tmp_path / "a.glb"), meshes, strict=True):
+        assert (row.mode, row.stored.dtype, "scale" in row.node) == (4, np.float32, False)
+        assert (row.faces == mesh.faces).all()
+        np.testing.assert_allclose(row.vertices, mesh.vertices - ORIGIN, atol=4e-6)
 
 
 def test_rows_of_the_same_faces_share_them(tmp_path):
@@ -158,6 +332,7 @@ def test_more_than_65535_vertices_take_wide_indices(tmp_path):
     write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
     document = read(tmp_path / "a.glb")
     assert document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]["componentType"] == 5125
+    assert oriented(decode(tmp_path / "a.glb")[0].faces) == oriented(mesh.faces)
 
 
 def test_no_rows_give_a_root_alone(tmp_path):
@@ -165,6 +340,7 @@ def test_no_rows_give_a_root_alone(tmp_path):
     document = read(tmp_path / "a.glb")
     assert len(document["nodes"]) == 1
     assert "meshes" not in document
+    assert "extensionsRequired" not in document
 
 
 # Open3D

@@ -8,10 +8,11 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.canopy import find_feet, measure_sections, quantile_of, separate_canopy, summarise_rows
+from vinemap.canopy import find_feet, separate_canopy
 from vinemap.cloud import PointCloud, Sections
 from vinemap.ground import height_above_ground, terrain_model
 from vinemap.raster import Grid, Raster
+from vinemap.section_table import measure_sections, quantile_of, summarise_rows
 from vinemap.sections import cut_sections
 
 UTM = CRS.from_epsg(32632)
@@ -75,8 +76,9 @@ def test_points_go_to_the_nearest_row():
 def test_no_rows_no_sections():
     xyz = np.zeros((5, 3))
     sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame([]), gaps_frame(), flat(-5, -5))
-    canopy, feet = find_feet(separate_canopy(sections))
-    table = measure_sections(canopy, np.empty((0, 7, 2)), np.empty(0), crs=UTM)
+    canopy, feet = find_feet(separate_canopy(sections)[0])
+    none = np.empty(0)
+    table = measure_sections(canopy, none, np.empty((0, 7, 2)), none, (none, none, none), crs=UTM)
     assert len(table) == len(feet) == 0
     assert len(summarise_rows(rows_frame([]), table, step=0.25)) == 0
 
@@ -86,7 +88,7 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     heights = height_above_ground(cloud, dtm)
     truth = vineyard.rows.assign(row_id=vineyard.rows["row"], spacing_m=2.5)
     sections = cut_sections(cloud, heights, truth, gaps_frame(), dtm)
-    canopy = separate_canopy(sections)
+    canopy, soil = separate_canopy(sections)
     # Sections where vines are dead fall away, those of living vines stay.
     dead = vineyard.dead_vines
     dead = dead[dead.groupby("row")["vine"].transform("size") >= 3]
@@ -96,10 +98,16 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     assert len(canopy.row_id) == pytest.approx(living * 0.9 / 0.25, rel=0.05)
     assert canopy.height.min() >= 0.4
     canopy, feet = find_feet(canopy)
-    assert np.median(feet[:, 0, 1]) == pytest.approx(0.6, abs=0.15)
+    assert np.median(feet[:, 0, 1]) == pytest.approx(0.55, abs=0.06)
+    # The thesis's stand on the soil, under the walls.
+    assert (soil[:, 0] == 0).all()
+    assert np.median(soil[:, 1, 0]) == pytest.approx(0.25, abs=0.12)
+    assert np.median(soil[:, 2, 0]) == pytest.approx(-0.25, abs=0.12)
+    assert np.abs(np.median(soil[:, 1:, 1], axis=0)).max() < 0.3
     assert (feet[:, 1, 0] >= feet[:, 2, 0]).all()
     m = len(canopy.row_id)
-    table = measure_sections(canopy, np.tile(feet[:, [0, 1, 2]], (1, 1, 1)), np.full(m, 0.5), crs=UTM)
+    ones = np.ones(m)
+    table = measure_sections(canopy, feet[:, 0, 1], feet, 0.5 * ones, (ones, 0 * ones, 0 * ones), crs=UTM)
     rows = summarise_rows(truth, table, step=0.25)
     assert np.abs(rows["height_m"] - truth["mean_height"]).max() < 0.08
     assert np.abs(rows["width_m"] - truth["mean_width"]).max() < 0.12
@@ -119,6 +127,7 @@ def one_section(points, heights=None):
         start,
         points,
         points[:, 1] if heights is None else heights,
+        np.arange(len(points)),
     )
 
 
@@ -127,7 +136,7 @@ def test_soil_noise_on_flat_ground_is_no_canopy():
     rng = np.random.default_rng(0)
     soil = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.normal(0, 0.03, 200)])
     leaves = np.column_stack([rng.normal(0, 0.2, 100), rng.uniform(0.6, 1.9, 100)])
-    canopy = separate_canopy(one_section(np.concatenate([soil, leaves])))
+    canopy, _ = separate_canopy(one_section(np.concatenate([soil, leaves])))
     assert len(canopy.points) > 90
     assert canopy.points[:, 1].min() > 0.5
 
@@ -136,7 +145,7 @@ def test_flyers_are_no_canopy():
     rng = np.random.default_rng(0)
     leaves = np.column_stack([rng.normal(0, 0.15, 150), rng.uniform(0.6, 1.9, 150)])
     flyers = np.array([[0.85, 1.5], [-0.8, 2.6], [0.7, 2.2]])
-    canopy = separate_canopy(one_section(np.concatenate([leaves, flyers])))
+    canopy, _ = separate_canopy(one_section(np.concatenate([leaves, flyers])))
     assert np.abs(canopy.points[:, 0]).max() < 0.6
     assert canopy.points[:, 1].max() < 2.0
 

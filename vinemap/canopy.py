@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import geopandas as gpd
 import numpy as np
-import shapely
-from scipy.ndimage import correlate1d
 
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.mesh import Mesh, loft, merge
 
 if TYPE_CHECKING:
+    import geopandas as gpd
     from numpy.typing import NDArray
-    from pyproj import CRS
 
     from vinemap.cloud import Sections
 
@@ -24,10 +22,16 @@ BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""
 NOISE_CELL = 0.1
 """Metres: cells of a section in which a point has neighbours or is noise."""
-FOOT_QUANTILE = 0.02
-"""Order of the height, among a section's canopy points, at which foliage begins."""
-FOOT_BAND = 0.2
-"""Metres above the foot whose points tell how wide the canopy stands on it."""
+GROUND = 0.3
+"""Metres above or below the terrain model within which points tell the inter-row's elevation."""
+FARTHEST = 0.1
+"""Metres that foliage reaches beyond its points at the most."""
+FOOT_BIN = 0.025
+"""Metres: bins of the histograms that tell the foliage's foot."""
+FOOT_RANKS = 0.02, 0.1
+"""Orders of the heights through which the line is drawn that falls to no points at the foot."""
+FOOT_BAND, FOOT_SPREAD = 0.15, 0.8
+"""Metres above the foot whose points tell how wide the canopy stands on it, and the quantile of their spread."""
 
 
 def separate_canopy(
@@ -40,7 +44,7 @@ def separate_canopy(
     min_points: int = 8,
     min_share: float = 0.15,
     min_height: float = 0.8,
-) -> Sections:
+) -> tuple[Sections, Values]:
     """Keep the canopy's points, and the sections that have a canopy.
 
     On each side of γ a plane runs from the foot of the vines to the canopy's wall at the elevation of the inter-row
@@ -62,83 +66,123 @@ def separate_canopy(
         Share of the median section's points that a section must have.
     min_height : float
         Metres that 90% height of a section must reach.
+
+    Returns
+    -------
+    canopy : Sections
+        Canopy points of the sections that have a canopy.
+    soil : (m, 3, 2) array
+        The thesis's fixed vertices of the c-gon: v1 on γ, v2 and vc under both walls at the inter-row's elevation.
     """
-    section = sections.section
-    side = sections.points[:, 0] >= 0
-    y, z = np.abs(sections.points[:, 0]), sections.points[:, 1]
-    canopy = (sections.height >= margin) & (sections.height <= max_height) & (y <= half_width)
-    slope = np.zeros(len(y))
-    for sign in (True, False):
-        on = side == sign
-        slope[on] = _plane_slope(sections, on, canopy)[section[on]]
-    canopy &= z >= slope * y + margin
-    canopy &= _has_neighbours(sections.points, section, canopy, min_neighbours)
-    n = np.bincount(section[canopy], minlength=len(sections.row_id))
-    enough = n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)
-    enough &= quantile_of(sections.height[canopy], np.concatenate([[0], np.cumsum(n)]), 0.9) >= min_height
-    return sections.subset(canopy & enough[section], enough)
-
-
-def _plane_slope(sections: Sections, on: Flags, canopy: Flags) -> Values:
-    """Slope h/w (m,) of the plane on one side of every section: elevation of the inter-row over the wall's distance."""
     m = len(sections.row_id)
-    section = sections.section
-    y, z = np.abs(sections.points[:, 0]), sections.points[:, 1]
-    wall = _peak(y[on & canopy], section[on & canopy], m, 0.0, 1.0)
-    ground = on & (np.abs(sections.height) < 0.3) & (y > wall[section])
-    level = _peak(z[ground], section[ground], m, -1.5, 1.5)
-    # The inter-row's elevation is that of its middle: the plane through it must not be steeper than the ground.
-    distance = np.bincount(section[ground], weights=y[ground], minlength=m) / np.maximum(
-        np.bincount(section[ground], minlength=m), 1
+    keep = np.zeros(len(sections.points), dtype=bool)
+    walls, n, tall = np.zeros((m, 2, 2)), np.zeros(m, dtype=np.int64), np.zeros(m)
+    limits = (margin, half_width, max_height, min_neighbours)
+    in_threads(
+        lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, n, tall),
+        stretches(m),
     )
-    return np.where(distance > 0, level / np.maximum(distance, 0.2), 0.0)
+    enough = (n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)) & (
+        tall >= min_height
+    )
+    soil = np.concatenate([np.zeros((m, 1, 2)), walls * np.array([[1.0, 1.0], [-1.0, 1.0]])], axis=1)
+    return sections.subset(keep & np.repeat(enough, np.diff(sections.start)), enough), soil[enough]
 
 
-def _peak(values: Values, section: NDArray[np.int64], m: int, low: float, high: float) -> Values:
-    """Position (m,) of the peak of each section's histogram of values between two bounds; 0 where it has none."""
-    n = round((high - low) / BIN)
-    bins = np.clip(((values - low) / BIN).astype(np.int64), 0, n - 1)
-    histogram = np.bincount(section * n + bins, minlength=m * n).reshape(m, n)
-    smooth = correlate1d(histogram.astype(float), [0.25, 0.5, 0.25], axis=1)
-    return np.where(histogram.any(axis=1), low + (smooth.argmax(axis=1) + 0.5) * BIN, 0.0)
+@compiled
+def _separate(
+    first: int,
+    last: int,
+    start: NDArray[np.int64],
+    points: Values,
+    height: Values,
+    limits: tuple[float, float, float, float],
+    keep: Flags,
+    walls: Values,
+    n: NDArray[np.int64],
+    tall: Values,
+) -> None:
+    """Flag the canopy's points of sections; write wall w and level h of both sides, points and 90% height."""
+    margin, half_width, max_height, share = limits
+    for k in range(first, last):
+        mine = slice(start[k], start[k + 1])
+        y, z, up, kept = points[mine, 0], points[mine, 1], height[mine], keep[mine]
+        for p in range(len(y)):
+            kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
+        for side in range(2):
+            w, h, distance = _plane(y if side == 0 else -y, z, up, kept)
+            walls[k, side] = w, h
+            slope = h / max(distance, 0.2)
+            for p in range(len(y)):
+                if (y[p] >= 0) == (side == 0):
+                    kept[p] = kept[p] and z[p] >= slope * abs(y[p]) + margin
+        _drop_noise(y, z, kept, share)
+        n[k] = kept.sum()
+        if n[k]:
+            tall[k] = np.quantile(up[kept], 0.9)
 
 
-def _has_neighbours(points: Values, section: NDArray[np.int64], canopy: Flags, share: float) -> Flags:
-    """Whether at least a share of its section's canopy points, and two others, lie around each point (n, 2)."""
-    m = int(section[-1]) + 1 if len(section) else 0
-    out = np.zeros(len(points), dtype=bool)
-    if not canopy.any():
-        return out
-    cell = np.floor(points[canopy] / NOISE_CELL).astype(np.int64)
-    cell -= cell.min(axis=0)
-    ny, nz = cell.max(axis=0) + 1
-    index = (section[canopy] * ny + cell[:, 0]) * nz + cell[:, 1]
-    n = np.bincount(index, minlength=m * ny * nz).reshape(m, ny, nz).astype(np.float32)
-    around = correlate1d(correlate1d(n, [1, 1, 1], axis=1, mode="constant"), [1, 1, 1], axis=2, mode="constant")
-    total = np.bincount(section[canopy], minlength=m)[section[canopy]]
-    out[canopy] = around.ravel()[index] >= np.maximum(3, share * total)
-    return out
+@compiled
+def _plane(y: Values, z: Values, up: Values, canopy: Flags) -> tuple[float, float, float]:
+    """Wall w and elevation h of the inter-row on the side of positive y (Eq. 6–9), and the inter-row's distance.
+
+    The elevation is that of the inter-row's middle: the plane through it must not be steeper than the ground.
+    """
+    walls, levels = np.zeros(round(1 / BIN)), np.zeros(round(3 / BIN))
+    middle = up[canopy].mean() if canopy.any() else 0.0
+    for p in range(len(y)):
+        # The upper half of a canopy seen from above is its top rather than its walls.
+        if y[p] >= 0 and canopy[p] and up[p] <= middle:
+            walls[min(int(y[p] / BIN), len(walls) - 1)] += 1
+    wall = _peak(walls) * BIN
+    way, n = 0.0, 0
+    for p in range(len(y)):
+        if y[p] > wall and abs(up[p]) < GROUND:
+            levels[min(max(int((z[p] + 1.5) / BIN), 0), len(levels) - 1)] += 1
+            way, n = way + y[p], n + 1
+    return wall, _peak(levels) * BIN - 1.5 if n else 0.0, way / n if n else 1.0
 
 
-def quantile_of(values: Values, start: NDArray[np.int64], q: float) -> Values:
-    """Quantile (m,) of the values (n,) of each section; 0 where it has none."""
-    n = np.diff(start)
-    section = np.repeat(np.arange(len(n)), n)
-    ordered = values[np.lexsort((values, section))]
-    if len(ordered) == 0:
-        return np.zeros(len(n))
-    rank = q * np.maximum(n - 1, 0)
-    low = np.minimum(start[:-1] + np.floor(rank).astype(np.int64), len(ordered) - 1)
-    high = np.minimum(start[:-1] + np.ceil(rank).astype(np.int64), len(ordered) - 1)
-    part = rank - np.floor(rank)
-    return np.where(n > 0, ordered[low] * (1 - part) + ordered[high] * part, 0.0)
+@compiled
+def _peak(histogram: Values) -> float:
+    """Position of the peak of a histogram, smoothed, in bins; 0 where it is empty."""
+    best, most = -0.5, 0.0
+    for i in range(len(histogram)):
+        left, right = histogram[max(i - 1, 0)], histogram[min(i + 1, len(histogram) - 1)]
+        height = 2 * histogram[i] + left + right
+        if height > most:
+            best, most = float(i), height
+    return best + 0.5
 
 
-def find_feet(canopy: Sections) -> tuple[Sections, Values]:
+@compiled
+def _drop_noise(y: Values, z: Values, kept: Flags, share: float) -> None:
+    """Unflag points with less than a share of the flagged, or fewer than two others, in the cells around."""
+    n, low, high, west, east = 0, np.inf, -np.inf, np.inf, -np.inf
+    for p in range(len(y)):
+        if kept[p]:
+            n += 1
+            low, high = min(low, z[p]), max(high, z[p])
+            west, east = min(west, y[p]), max(east, y[p])
+    if n == 0:
+        return
+    cells = np.zeros((int((east - west) / NOISE_CELL) + 3, int((high - low) / NOISE_CELL) + 3))
+    for p in range(len(y)):
+        if kept[p]:
+            cells[int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1] += 1
+    least = max(3.0, share * n)
+    for p in range(len(y)):
+        if kept[p]:
+            i, j = int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1
+            kept[p] = cells[i - 1 : i + 2, j - 1 : j + 2].sum() >= least
+
+
+def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]:
     """Find where the foliage of every section begins: the c-gon's fixed vertices v1, v2 and vc.
 
     The thesis sets them at soil level, where the polygon takes in the void under the canopy; here they lie at the
-    foliage's foot: v1 under its middle, v2 and vc at its sides.
+    foliage's foot: v1 under its middle, v2 and vc at its sides. A section's few points seldom show its foot, which
+    seen from the air lies in the shade: the points of all sections within ``pool`` metres along the row tell it.
 
     Returns
     -------
@@ -148,72 +192,81 @@ def find_feet(canopy: Sections) -> tuple[Sections, Values]:
         v1, v2 (left of γ, positive y) and vc of every section, in metres of its frame.
     """
     m = len(canopy.row_id)
-    foot = quantile_of(canopy.points[:, 1], canopy.start, FOOT_QUANTILE)
-    canopy = canopy.subset(canopy.points[:, 1] >= foot[canopy.section], np.ones(m, dtype=bool))
-    y, z = canopy.points.T
-    band = z <= foot[canopy.section] + FOOT_BAND
-    n = np.bincount(canopy.section[band], minlength=m)
-    start = np.concatenate([[0], np.cumsum(n)])
-    left, right = quantile_of(y[band], start, 0.95), quantile_of(y[band], start, 0.05)
+    if m == 0:
+        return canopy, np.empty((0, 3, 2))
+    near = _window(canopy, pool)
+    levels = _pooled(_histograms(canopy.points[:, 1], canopy.start, 0.0, FOOT_BIN, round(3 / FOOT_BIN)), near)
+    low, high = (_rank(levels, q) * FOOT_BIN for q in FOOT_RANKS)
+    foot = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
+    canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)), np.ones(m, dtype=bool))
+    near_foot: Flags = canopy.points[:, 1] <= np.repeat(foot, np.diff(canopy.start)) + FOOT_BAND
+    band = canopy.subset(near_foot, np.ones(m, dtype=bool))
+    widths = _pooled(_histograms(band.points[:, 0], band.start, -1.0, FOOT_BIN, round(2 / FOOT_BIN)), near)
+    right, left = (_rank(widths, q) * FOOT_BIN - 1.0 for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
     feet = np.stack([(left + right) / 2, foot, left, foot, right, foot], axis=-1).reshape(m, 3, 2)
     return canopy, feet
 
 
-def measure_sections(canopy: Sections, polygons: Values, area: Values, *, crs: CRS) -> gpd.GeoDataFrame:
-    """Table of sections, each as a line across the row on the ground.
+def _window(canopy: Sections, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and last + 1 of the sections (m,) of the same row within reach of each."""
+    row = np.unique(canopy.row_id, return_inverse=True)[1]
+    key = row * (canopy.position.max() + 3 * reach) + canopy.position
+    return np.searchsorted(key, key - reach), np.searchsorted(key, key + reach, side="right")
 
-    Heights and widths come from quantiles of the points, never from the polygons' corners.
+
+def _pooled(histograms: Values, near: tuple[NDArray[np.int64], NDArray[np.int64]]) -> Values:
+    """Sums (m, bins) of the histograms of the sections in each one's window."""
+    before = np.concatenate([np.zeros((1, histograms.shape[1])), np.cumsum(histograms, axis=0)])
+    out: Values = before[near[1]] - before[near[0]]
+    return out
+
+
+@compiled
+def _histograms(values: Values, start: NDArray[np.int64], low: float, width: float, bins: int) -> Values:
+    """Histograms (m, bins) of each section's values; what lies beyond counts in the outer bins."""
+    out = np.zeros((len(start) - 1, bins))
+    for k in range(len(start) - 1):
+        for value in values[start[k] : start[k + 1]]:
+            out[k, min(max(int((value - low) / width), 0), bins - 1)] += 1
+    return out
+
+
+@compiled
+def _rank(histograms: Values, q: float) -> Values:
+    """Quantile (m,) of histograms (m, bins), in bins."""
+    out = np.zeros(len(histograms))
+    for k in range(len(histograms)):
+        total = np.cumsum(histograms[k])
+        wanted = q * total[-1]
+        i = np.searchsorted(total, wanted)
+        before = total[i - 1] if i > 0 else 0.0
+        out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total[-1] else 0.5 * len(total)
+    return out
+
+
+def foliage_reach(canopy: Sections, area: Values, perimeter: Values, vertices: NDArray[np.int64]) -> Values:
+    """Metres (m,) by which the foliage reaches beyond the hulls of its points, a mean for every row.
+
+    A hull of points falls short of the body that they were taken from, the more the fewer they are: by the share of
+    its area that its vertices are of the points (Efron 1965; Baldin and Reiß 2016).
 
     Parameters
     ----------
     canopy : Sections
-        Canopy points of every section.
-    polygons : (m, c, 2) array
-        c-gons in the sections' frames, in metres.
-    area : (m,) array
-        Their areas in m².
-
-    Returns
-    -------
-    GeoDataFrame
-        LineStringZ with ``row_id``, ``position_m``, ``height_m`` (98.5% height above ground), ``bottom_m`` (2%),
-        ``width_m`` (2–98% across), ``area_m2`` and ``n_points``.
+        m sections with the points that their hulls hold.
+    area, perimeter, vertices : (m,) array
+        Of the hulls, in m² and m; NaN where there is none.
     """
-    y = canopy.points[:, 0]
-    left, right = quantile_of(y, canopy.start, 0.98), quantile_of(y, canopy.start, 0.02)
-    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0]])
-    reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
-    ends = canopy.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
-    level = np.repeat(canopy.origin[:, None, 2:], 2, axis=1)
-    return gpd.GeoDataFrame(
-        {
-            "row_id": canopy.row_id,
-            "position_m": canopy.position,
-            "height_m": quantile_of(canopy.height, canopy.start, 0.985),
-            "bottom_m": quantile_of(canopy.height, canopy.start, 0.02),
-            "width_m": left - right,
-            "area_m2": area,
-            "n_points": np.diff(canopy.start),
-        },
-        geometry=shapely.linestrings(np.concatenate([ends, level], axis=2)) if len(ends) else [],
-        crs=crs,
-    )
+    row, n = np.unique(canopy.row_id, return_inverse=True)[1], np.diff(canopy.start)
 
+    def mean(values: NDArray[Any]) -> Values:
+        out: Values = np.bincount(row, weights=np.nan_to_num(values)) / np.maximum(np.bincount(row, weights=n > 0), 1)
+        return out
 
-def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
-    """Give rows their canopy's mean ``height_m`` and ``width_m``, and its ``volume_m3``; NaN where there is none.
-
-    The volume lies between consecutive sections, as the mesh's does: the mean of their areas times their distance.
-    """
-    groups = sections.groupby("row_id")
-    means = groups[["height_m", "width_m"]].mean().reindex(rows["row_id"])
-    position, area = sections["position_m"].to_numpy(), sections["area_m2"].to_numpy()
-    joined = ~_breaks(sections["row_id"].to_numpy(), position, step)
-    pieces = (area[1:] + area[:-1]) / 2 * np.diff(position) * joined
-    volume = sections.iloc[1:].assign(piece=pieces).groupby("row_id")["piece"].sum().reindex(rows["row_id"])
-    return rows.assign(
-        height_m=means["height_m"].to_numpy(), width_m=means["width_m"].to_numpy(), volume_m3=volume.to_numpy()
-    )
+    points, corners = mean(n), mean(vertices)
+    missing = mean(area) * corners / np.maximum(points - corners, 1)
+    out: Values = np.minimum(missing / np.maximum(mean(perimeter), 1e-9), FARTHEST)[row]
+    return out
 
 
 def _breaks(row_id: NDArray[np.int64], position: Values, step: float) -> Flags:
@@ -241,13 +294,13 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
     corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
     breaks = _breaks(canopy.row_id, canopy.position, step)
-    runs = np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1)
-    meshes = []
-    numbers = rows.drop(columns="geometry").set_index("row_id", drop=False)
-    for row_id, values in numbers.iterrows():
-        pieces = [loft(corners[run]) for run in runs if len(run) > 1 and canopy.row_id[run[0]] == row_id]
-        if pieces:
-            meshes.append(
-                Mesh(*merge(pieces), row_id=int(values["row_id"]), label=str(values["label"]), extras=values.to_dict())
-            )
-    return meshes
+    pieces: dict[int, list[Any]] = {}
+    for run in np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1):
+        if len(run) > 1:
+            pieces.setdefault(int(canopy.row_id[run[0]]), []).append(loft(corners[run]))
+    numbers = rows.drop(columns="geometry").to_dict("records")
+    return [
+        Mesh(*merge(pieces[row["row_id"]]), row_id=int(row["row_id"]), label=str(row["label"]), extras=row)
+        for row in numbers
+        if row["row_id"] in pieces
+    ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,19 @@ LONGEST = 256
 """An outline of more edges is first simplified from outside: no two edges in a row turn by less than 360°/LONGEST."""
 
 
+class Peeled(NamedTuple):
+    """What is left of m sections of n points once their outliers are peeled off."""
+
+    kept: Flags
+    """(n,) False for outliers and non-finite points."""
+    area: Floats
+    """(m,) area of the kept points' convex hull, m²; NaN for fewer than 3 finite points."""
+    perimeter: Floats
+    """(m,) length of that hull's outline, m."""
+    vertices: Ints
+    """(m,) its vertices."""
+
+
 class Enclosures(NamedTuple):
     """The c-gons of m sections that hold n points."""
 
@@ -42,9 +55,69 @@ class Enclosures(NamedTuple):
     """(m,) area of the kept points' convex hull, m²."""
     area: Floats
     """(m,) area of the c-gon, m²."""
+    shared_area: Floats
+    """(m,) area that the c-gon and that hull share, m²."""
 
 
-def enclose(points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7, share: float = 0.02) -> Enclosures:
+def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -> Peeled:
+    """Peel a share of every section's points, rounded up, off as outliers; at least 3 points stay (Algorithm 1).
+
+    Parameters
+    ----------
+    points : array_like of shape (n, 2)
+        (y, z) of all sections, section after section, m.
+    start : array_like of shape (m + 1,)
+        Section k holds ``points[start[k]:start[k + 1]]``.
+    share : float
+        Share of a section's points.
+
+    Raises
+    ------
+    ValueError
+        If share or start is out of bounds.
+    """
+    section = as_complex(points)
+    offsets = _checked(start, len(section), share)
+    m = len(offsets) - 1
+    kept, area, perimeter = np.isfinite(section), np.full(m, math.nan), np.full(m, math.nan)
+    vertices = np.zeros(m, dtype=np.int64)
+    in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, vertices), stretches(m))
+    return Peeled(kept, area, perimeter, vertices)
+
+
+def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike) -> tuple[Floats, Ints, Floats]:
+    """Outline of every section's foliage: the convex hull of its points and its feet, and what lies within reach of it.
+
+    Parameters
+    ----------
+    points, start : array_like of shape (n, 2), (m + 1,)
+        As in :func:`peel_sections`.
+    feet : array_like of shape (m, 3, 2)
+        v1 (bottom, middle), v2 (left foot, positive y) and vc (right foot), m.
+    reach : array_like of shape (m,)
+        Metres by which edges are moved outward.
+
+    Returns
+    -------
+    points : array (k, 2)
+        Vertices of the outlines, section after section; a corner becomes an edge.
+    start : array (m + 1,)
+        Where each section's begin.
+    feet : array (m, 3, 2)
+        The feet, moved down by the reach and outward by half of it.
+    """
+    section = as_complex(points)
+    offsets = _checked(start, len(section), 0.0)
+    fixed, out = as_complex(feet).reshape(-1, 3), np.asarray(reach, dtype=float)
+    outline, first = _grow_all(section, offsets, fixed, out)
+    left = np.where(fixed[:, 1].real >= fixed[:, 2].real, 0.5, -0.5)
+    moved = fixed + out[:, None] * np.stack([0 * left - 1j, left - 1j, -left - 1j], axis=1)
+    return as_pairs(outline), first, as_pairs(moved)
+
+
+def enclose(
+    points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7, share: float = 0.02, slide: bool = False
+) -> Enclosures:
     """Peel every section's outliers and enclose the rest in the c-gon of minimum area whose v1, v2, vc are given.
 
     The polygon leaves v2 and arrives at vc along the hull of (kept points, v2, vc), so all kept points are left of all
@@ -66,6 +139,9 @@ def enclose(points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7,
         Number of vertices, 5 or more (with 4 the polygon may have to be infinite).
     share : float
         Share of a section's points to peel, rounded up; at least 3 points stay.
+    slide : bool
+        Whether v2 and vc may slide along the hull's edge that holds v1, to where the area is least; where no edge
+        does they stay.
 
     Raises
     ------
@@ -76,16 +152,27 @@ def enclose(points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7,
     -----
     Algorithm 1 and Eq. 12-19 of the thesis; the bilinear programme's optimum is found exactly, by choosing edges.
     """
-    offsets, fixed = np.ascontiguousarray(start, dtype=np.int64), as_complex(feet).reshape(-1, 3)
-    section = as_complex(points)
+    section, fixed = as_complex(points), as_complex(feet).reshape(-1, 3)
+    offsets = _checked(start, len(section), share)
     if c < 5:
         raise ValueError(f"c is {c}: a c-gon with three fixed vertices needs c >= 5")
+    if len(offsets) != len(fixed) + 1:
+        raise ValueError(f"start must climb from 0 to {len(section)} in {len(fixed) + 1} numbers")
+    m = len(fixed)
+    polygon, kept, areas = np.full((m, c), complex(math.nan, math.nan)), np.isfinite(section), np.full((3, m), math.nan)
+    in_threads(
+        lambda part: _enclose_all(*part, section, offsets, fixed, share, slide, polygon, kept, areas), stretches(m)
+    )
+    return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), kept, *areas)
+
+
+def _checked(start: ArrayLike, n: int, share: float) -> Ints:
+    offsets = np.ascontiguousarray(start, dtype=np.int64)
     if not 0 <= share < 1:
         raise ValueError(f"share is {share}: give a share of the points in [0, 1)")
-    if len(offsets) != len(fixed) + 1 or offsets[0] != 0 or offsets[-1] != len(section) or np.any(np.diff(offsets) < 0):
-        raise ValueError(f"start must climb from 0 to {len(section)} in {len(fixed) + 1} numbers")
-    polygon, kept, hull_area, area = _enclose_all(section, offsets, fixed, c, share)
-    return Enclosures(as_pairs(polygon), np.isfinite(area), kept, hull_area, area)
+    if len(offsets) == 0 or offsets[0] != 0 or offsets[-1] != n or np.any(np.diff(offsets) < 0):
+        raise ValueError(f"start must climb from 0 to {n}")
+    return offsets
 
 
 def hull(points: ArrayLike) -> Ints:
@@ -466,22 +553,120 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
 
 
 @compiled
+def _slide(rest: Points, bottom: complex, out: Points) -> bool:
+    """Write the c-gon whose v2 and vc lie on the line of the edge of ``rest`` that holds v1; whether one does."""
+    c, extent = len(out), 0.0
+    for corner in rest:
+        extent = max(extent, abs(corner - bottom))
+    for k in range(len(rest)):
+        a, b = rest[k - 1], rest[k]
+        if a.real < bottom.real < b.real and abs(_cross(a, b, bottom)) <= FLAT * extent * abs(b - a):
+            q = _outline(rest, bottom, bottom)
+            if len(q) > LONGEST:
+                q = _simplify(q)
+            free = _split(q, c + 2) if len(q) < c + 2 else _choose(q, c + 2)
+            if len(free) == 0:
+                return False
+            out[0], out[1:] = bottom, free
+            return True
+    return False
+
+
+@compiled
+def _shared(polygon: Points, convex: Points) -> float:
+    """Area that a polygon shares with a convex one, both counter-clockwise (Sutherland and Hodgman 1974)."""
+    inside = polygon.copy()
+    for k in range(len(convex)):
+        a, b = convex[k - 1], convex[k]
+        out = np.empty(2 * len(inside) + 2, dtype=np.complex128)
+        size = 0
+        for i in range(len(inside)):
+            p, q = inside[i - 1], inside[i]
+            left_p, left_q = _cross(a, b, p), _cross(a, b, q)
+            if (left_p < 0) != (left_q < 0):
+                out[size] = p + (q - p) * (left_p / (left_p - left_q))
+                size += 1
+            if left_q >= 0:
+                out[size] = q
+                size += 1
+        inside = out[:size]
+        if size < 3:
+            return 0.0
+    return _area(inside)
+
+
+@compiled
+def _peel_one(points: Points, kept: Flags, share: float) -> Points:
+    """The convex hull of a section's kept points, once the outliers among them are no longer kept."""
+    here = np.flatnonzero(kept)
+    p = points[here]
+    order = _sorted(p)
+    p = p[order]
+    removed, ring = _peel(p, order, math.ceil(share * len(p) - 1e-9))
+    for i in removed:
+        kept[here[order[i]]] = False
+    return p[ring]
+
+
+@compiled
+def _peel_all(
+    first: int,
+    last: int,
+    points: Points,
+    start: Ints,
+    share: float,
+    kept: Flags,
+    area: Floats,
+    perimeter: Floats,
+    vertices: Ints,
+) -> None:
+    for k in range(first, last):
+        mine = slice(start[k], start[k + 1])
+        if kept[mine].sum() >= 3:
+            ring = _peel_one(points[mine], kept[mine], share)
+            area[k], vertices[k], perimeter[k] = _area(ring), len(ring), 0.0
+            for i in range(len(ring)):
+                perimeter[k] += abs(ring[i] - ring[i - 1])
+
+
+@compiled
+def _grow_all(points: Points, start: Ints, feet: Points, reach: Floats) -> tuple[Points, Ints]:
+    first = np.zeros(len(start), dtype=np.int64)
+    out = np.empty(2 * (len(points) + 2 * len(feet)), dtype=np.complex128)
+    size = 0
+    for k in range(len(feet)):
+        n = start[k + 1] - start[k]
+        body = np.empty(n + 2, dtype=np.complex128)
+        body[:n], body[n], body[n + 1] = points[start[k] : start[k + 1]], feet[k, 1], feet[k, 2]
+        body = body[_sorted(body)]
+        ring = body[_hull(body)]
+        for i in range(len(ring)):
+            edge = ring[i] - ring[i - 1]
+            outward = -1j * edge / abs(edge) * reach[k] if edge != 0 else 0j
+            out[size], out[size + 1] = ring[i - 1] + outward, ring[i] + outward
+            size += 2
+        first[k + 1] = size
+    return out[:size], first
+
+
+@compiled
 def _enclose_all(
-    points: Points, start: Ints, feet: Points, c: int, share: float
-) -> tuple[Points, Flags, Floats, Floats]:
-    m = len(feet)
-    polygon = np.full((m, c), complex(math.nan, math.nan))
-    hull_area, area = np.full(m, math.nan), np.full(m, math.nan)
-    kept = np.isfinite(points)
-    for k in range(m):
-        here = start[k] + np.flatnonzero(kept[start[k] : start[k + 1]])
-        if len(here) >= 3 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
-            p = points[here]
-            order = _sorted(p)
-            p = p[order]
-            removed, ring = _peel(p, order, math.ceil(share * len(p) - 1e-9))
-            for i in removed:
-                kept[here[order[i]]] = False
-            _polygon(p[ring], feet[k, 0], feet[k, 1], feet[k, 2], polygon[k])
-            hull_area[k], area[k] = _area(p[ring]), _area(polygon[k])
-    return polygon, kept, hull_area, area
+    first: int,
+    last: int,
+    points: Points,
+    start: Ints,
+    feet: Points,
+    share: float,
+    slide: bool,
+    polygon: Points,
+    kept: Flags,
+    areas: Floats,
+) -> None:
+    """Write c-gons (m, c), and the areas (3, m) of the hull, of the c-gon, and of what they share."""
+    for k in range(first, last):
+        mine = slice(start[k], start[k + 1])
+        if kept[mine].sum() >= 3 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
+            ring = _peel_one(points[mine], kept[mine], share)
+            if not (slide and _slide(ring, feet[k, 0], polygon[k])):
+                _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], polygon[k])
+            areas[0, k], areas[1, k], areas[2, k] = _area(ring), _area(polygon[k]), _shared(polygon[k], ring)

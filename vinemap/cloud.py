@@ -64,6 +64,8 @@ class Sections(NamedTuple):
     """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
     height: Values
     """Height above the terrain model (n,) in metres."""
+    member: NDArray[np.int64]
+    """Index (n,) of each point in the cloud; it climbs within a section."""
 
     @property
     def section(self) -> NDArray[np.int64]:
@@ -72,8 +74,8 @@ class Sections(NamedTuple):
 
     def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_]) -> Sections:
         """The points (n,) and sections (m,) that are flagged; no point of a section that isn't may be."""
-        n = np.bincount(self.section[points], minlength=len(sections))[sections]
-        start = np.concatenate([[0], np.cumsum(n)])
+        before = np.concatenate([[0], np.cumsum(points)])
+        start = np.concatenate([[0], np.cumsum(np.diff(before[self.start])[sections])])
         return Sections(
             self.row_id[sections],
             self.position[sections],
@@ -83,6 +85,7 @@ class Sections(NamedTuple):
             start,
             self.points[points],
             self.height[points],
+            self.member[points],
         )
 
 

@@ -153,6 +153,7 @@ class PolygonOptions(Options):
 
     c: int = Field(7, ge=5, le=30, description="vertices of a section's polygon")
     share: float = Field(0.02, ge=0, le=0.5, description="share of a section's points that is peeled off")
+    foot: Literal["foliage", "soil"] = Field("foliage", description="where v1, v2 and vc stand; the thesis's: soil")
 
 
 class Settings(Options):

@@ -13,8 +13,8 @@ import numpy as np
 
 from vinemap import __version__, paths
 from vinemap.blocks import group_blocks
-from vinemap.canopy import find_feet, measure_sections, section_meshes, separate_canopy, summarise_rows
-from vinemap.cgon import enclose
+from vinemap.canopy import find_feet, foliage_reach, section_meshes, separate_canopy
+from vinemap.cgon import enclose, grow, peel_sections
 from vinemap.cloud import PointCloud, Sections, read_cloud
 from vinemap.clustering import cluster_rows
 from vinemap.confidence import judge_rows
@@ -30,6 +30,7 @@ from vinemap.product import fingerprint, labelled, parcel_layer, write_product
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
+from vinemap.section_table import measure_sections, modelling_indices, summarise_rows
 from vinemap.sections import cut_sections
 from vinemap.vector import read_boundary
 
@@ -201,6 +202,7 @@ def map_parcel(
         run("Writing", write_product, draft, parcel, layers, (found.dtm, chm), found.field, meshes, points)
         counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
+        modelling = table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
         record = {
             "vinemap": __version__,
             "parcel": parcel,
@@ -211,6 +213,7 @@ def map_parcel(
             "vertical_datum": points.vertical,
             "origin": origin._asdict(),
             "counts": counts,
+            "modelling": modelling.to_dict() if len(table) else None,
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
             "versions": {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES},
             "files": sorted(path.name for path in draft.iterdir()),
@@ -223,12 +226,20 @@ def _model_canopy(
     sections: Sections, settings: Settings, crs: CRS
 ) -> tuple[Sections, NDArray[np.float64], gpd.GeoDataFrame]:
     """Canopy points of every section, their c-gons (m, c, 2), and the table of sections."""
-    options = settings.model_dump()
-    canopy, feet = find_feet(separate_canopy(sections, **options["canopy"]))
-    enclosed = enclose(canopy.points, canopy.start, feet, **options["polygon"])
-    canopy = canopy.subset(enclosed.kept, enclosed.valid)
-    polygons = enclosed.polygon[enclosed.valid]
-    return canopy, polygons, measure_sections(canopy, polygons, enclosed.area[enclosed.valid], crs=crs)
+    canopy, soil = separate_canopy(sections, **settings.canopy.model_dump())
+    canopy, feet = find_feet(canopy)
+    peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
+    canopy = canopy.subset(peeled.kept, np.ones(len(feet), dtype=bool))
+    reach = foliage_reach(canopy, peeled.area, peeled.perimeter, peeled.vertices)
+    outline, start, grown = grow(canopy.points, canopy.start, feet, reach)
+    on_foliage = settings.polygon.foot == "foliage"
+    fixed = grown if on_foliage else soil
+    model = enclose(outline, start, fixed, c=settings.polygon.c, share=0, slide=on_foliage)
+    valid = model.valid
+    canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
+    polygons, foliage = model.polygon[valid], model.hull_area[valid]
+    indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
+    return canopy, polygons, measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
 
 
 def _corner(dtm: Raster) -> Origin:

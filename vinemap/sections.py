@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from vinemap.cloud import Sections
+from vinemap.compiled import compiled, in_threads
 from vinemap.raster import sample
 from vinemap.row_frame import at, row_coordinates, tangents
 
@@ -53,28 +54,32 @@ def cut_sections(
         pairs = np.empty((0, 2))
         number = np.empty(0, dtype=np.int64)
         start = np.zeros(1, dtype=np.int64)
-        return Sections(number, none, np.empty((0, 3)), pairs, none, start, pairs, none)
+        return Sections(number, none, np.empty((0, 3)), pairs, none, start, pairs, none, number)
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]
     near = row_coordinates(cloud.xyz, curves, 0.5 * rows["spacing_m"].to_numpy())
-    # Rows are laid one behind the other so that one sort, and one search, finds the points of every section.
-    stride = max(line.length for line in lines) + 10 * width + 10
-    key = np.repeat(np.arange(len(lines)), np.diff(near.start)) * stride + near.along
-    order = np.argsort(key)
-    key, left, member = key[order], near.left[order], near.member[order]
-
     parts = [_stations(line, gaps[gaps["row_id"] == i], step) for line, i in zip(lines, rows["row_id"], strict=True)]
     station_row = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts)])
     position = np.concatenate(parts)
-    low = np.searchsorted(key, station_row * stride + position - width / 2, side="left")
-    high = np.searchsorted(key, station_row * stride + position + width / 2, side="right")
-    start = np.concatenate([[0], np.cumsum(high - low)])
-    index = np.arange(start[-1]) - np.repeat(start[:-1] - low, high - low)
+    bounds = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
 
+    def find(k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        mine = slice(near.start[k], near.start[k + 1])
+        return _members(near.along[mine], parts[k], width / 2)
+
+    found = in_threads(find, range(len(lines)))
+    start = np.concatenate([[0], np.cumsum(np.concatenate([n for n, _ in found]))])
     here = np.concatenate([at(curve, p) for curve, p in zip(curves, parts, strict=True)])
     tangent = np.concatenate([tangents(curve, p) for curve, p in zip(curves, parts, strict=True)])
     origin = np.column_stack([here, sample(dtm, here)])
-    z = cloud.xyz[member[index], 2] - np.repeat(origin[:, 2], high - low)
+    points, height, member = np.empty((start[-1], 2)), np.empty(start[-1]), np.empty(start[-1], dtype=np.int64)
+
+    def fill(k: int) -> None:
+        mine, into = slice(near.start[k], near.start[k + 1]), start[bounds[k] : bounds[k + 1] + 1]
+        level = origin[bounds[k] : bounds[k + 1], 2]
+        _fill(found[k][1], near.left[mine], near.member[mine], into, level, cloud.xyz, heights, points, height, member)
+
+    in_threads(fill, range(len(lines)))
     return Sections(
         rows["row_id"].to_numpy()[station_row],
         position,
@@ -82,9 +87,55 @@ def cut_sections(
         tangent,
         rows["spacing_m"].to_numpy()[station_row],
         start,
-        np.column_stack([left[index], z]),
-        heights[member[index]],
+        points,
+        height,
+        member,
     )
+
+
+@compiled
+def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """How many points (m,) lie within reach of each position along a row, and which, section after section."""
+    m = len(position)
+    n = np.zeros(m, dtype=np.int64)
+    first = np.searchsorted(position, along - reach)
+    for p in range(len(along)):
+        k = first[p]
+        while k < m and position[k] <= along[p] + reach:
+            n[k] += 1
+            k += 1
+    place = np.cumsum(n) - n
+    out = np.empty(n.sum(), dtype=np.int64)
+    for p in range(len(along)):
+        k = first[p]
+        while k < m and position[k] <= along[p] + reach:
+            out[place[k]] = p
+            place[k] += 1
+            k += 1
+    return n, out
+
+
+@compiled
+def _fill(
+    index: NDArray[np.int64],
+    left: Values,
+    member: NDArray[np.int64],
+    start: NDArray[np.int64],
+    level: Values,
+    xyz: Values,
+    heights: Values,
+    points: Values,
+    height: Values,
+    chosen: NDArray[np.int64],
+) -> None:
+    """Write the points, heights and members of a row's sections, whose soil lies at ``level`` (m,)."""
+    for k in range(len(level)):
+        for i in range(start[k], start[k + 1]):
+            p = index[i - start[0]]
+            points[i, 0] = left[p]
+            points[i, 1] = xyz[member[p], 2] - level[k]
+            height[i] = heights[member[p]]
+            chosen[i] = member[p]
 
 
 def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:

@@ -44,14 +44,18 @@ LAYERS: dict[str, Layer] = {
         | {"n_key_points": WHOLE}
         | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
         | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL)
-        | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT},
+        | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT}
+        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha"), REAL),
         "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
     ),
     "row_ends": Layer("Point Z", _ROW | {"end": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
     "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
     "sections": Layer(
         "LineString Z",
-        _ROW | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL) | {"n_points": WHOLE},
+        _ROW
+        | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL)
+        | {"n_points": WHOLE}
+        | dict.fromkeys(("trv_m3_ha", "lwa_m2_ha", "good", "under", "over", "reduction", "quality"), REAL),
         "Sections across the canopy",
     ),
     "gaps": Layer(
