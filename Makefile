@@ -6,12 +6,17 @@ SHELL := bash
 
 CONFIG ?= configs/barolo.yaml
 PYTHON ?= python3
+ifndef CLOUD
+tune: CLOUD := data/surveys/barolo/barolo.laz
+tune: BOUNDARY := data/surveys/barolo/parcels.gpkg
+tune: PARCEL := $(or $(PARCEL),F)
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel test check accuracy clean
+.PHONY: help parcel test check accuracy tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -37,6 +42,9 @@ check: $(READY) ## Check style, format and types
 
 accuracy: $(READY) ## Measure rows on simulated vineyards, fill README's table: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--readme README.md)
+
+tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
+	@$(BIN)/python -m vinemap.tune $(CLOUD) $(if $(BOUNDARY),--boundary $(BOUNDARY)) $(if $(PARCEL),--parcel "$(PARCEL)")
 
 clean: ## Remove .venv and the tools' caches; surveys and products stay
 	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -28,7 +28,7 @@ STAGES = {
     "confidence",
     "missing",
 }
-STAGES |= {"sections", "canopy", "cgon", "section_table", "odometry"}
+STAGES |= {"sections", "canopy", "cgon", "section_table", "classification", "odometry"}
 BESIDE = {"evaluate", "synthetic", "scenes"}
 SETTINGS = {"config", "paths"}
 CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
@@ -46,7 +46,9 @@ MAY_IMPORT = {
     **dict.fromkeys(SETTINGS, BASE),
     "product": CHAIN,
     "parcel": CHAIN | {"product"},
-    "accuracy": CHAIN | {"parcel"},
+    "canopy_accuracy": CHAIN | {"parcel"},
+    "accuracy": CHAIN | {"parcel", "canopy_accuracy"},
+    "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
     "flows": CHAIN | {"parcel", "cli", "flows"},

@@ -145,6 +145,11 @@ class Row(NamedTuple):
     """(m, 3) triangles that have three vertices."""
 
 
+def proper(faces):
+    """Whether triangles have three vertices."""
+    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+
+
 def decode(path):
     """The rows of a GLB that have a mesh, read as the specification says."""
     document, binary = chunks(path)
@@ -177,9 +182,8 @@ def decode(path):
             faces[1::2] = faces[1::2, ::-1]
         else:
             faces = order.reshape(-1, 3)
-        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
         vertices = stored * np.array(node.get("scale", [1, 1, 1])) + node["translation"]
-        rows.append(Row(node, primitive["mode"], stored, vertices, faces))
+        rows.append(Row(node, primitive["mode"], stored, vertices, faces[proper(faces)]))
     return rows
 
 
@@ -189,14 +193,16 @@ def oriented(faces):
 
 
 def loaded(path):
-    """Name and shape of each row as trimesh places it, without the strips' triangles of repeated vertices."""
+    """Name and shape of each row as trimesh places and merges it, without triangles of repeated vertices."""
     scene = trimesh.load(path)
     for label in scene.graph.nodes_geometry:
         transform, name = scene.graph[label]
         shape = scene.geometry[name].copy()
         shape.apply_transform(transform)
-        shape.update_faces((shape.faces != np.roll(shape.faces, 1, axis=1)).all(axis=1))
+        shape.update_faces(proper(shape.faces))
+        assert shape.is_watertight
         shape.merge_vertices()
+        shape.update_faces(proper(shape.faces))
         yield label, shape
 
 
@@ -216,10 +222,16 @@ def test_glb_has_a_node_a_row_with_its_numbers(tmp_path):
 @pytest.mark.parametrize("plain", [False, True])
 def test_glb_reads_back_in_metres_y_up(tmp_path, plain):
     path = tmp_path / "F_canopy.glb"
-    meshes = [*rows(), bumpy(100, turn=1, row_id=4, label="4 F"), bumpy(100, turn=-1, row_id=5, label="5 F")]
+    doubled = [[0, 0], [1, 0], [1, 0], [1, 2], [1, 2], [-1, 2], [-1, 0]]
+    meshes = [
+        *rows(),
+        bumpy(100, turn=1, row_id=4, label="4 F"),
+        bumpy(100, turn=-1, row_id=5, label="5 F"),
+        Mesh(*loft(along(doubled, sections=30)), row_id=6, label="6 F"),
+    ]
     write_glb(meshes, path, origin=ORIGIN, crs="EPSG:32632", plain=plain)
     shapes = dict(loaded(path))
-    assert set(shapes) == {"1 F", "2 F", "4 F", "5 F"}
+    assert set(shapes) == {"1 F", "2 F", "4 F", "5 F", "6 F"}
     for row in meshes:
         if row.label not in shapes:
             continue
@@ -287,14 +299,20 @@ def test_faces_of_any_order_are_written(tmp_path):
     sphere = trimesh.creation.icosphere()
     orders = {
         5: [np.concatenate([whole.faces, sphere.faces[:40] + 99]), np.delete(whole.faces, -3, axis=0)],
-        4: [whole.faces[1:], np.random.default_rng(0).permutation(whole.faces), sphere.faces, whole.faces[:3]],
+        4: [
+            whole.faces[1:],
+            np.random.default_rng(0).permutation(whole.faces),
+            sphere.faces,
+            whole.faces[:3],
+            np.full((1, 3), 5),
+        ],
     }
     for mode, meshes in orders.items():
         for faces in meshes:
             write_glb([Mesh(whole.vertices, faces)], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
             (row,) = decode(tmp_path / "a.glb")
             assert row.mode == mode
-            assert oriented(row.faces) == oriented(faces)
+            assert oriented(row.faces) == oriented(faces[proper(faces)])
 
 
 def test_a_section_takes_half_the_bytes_of_plain_lists(tmp_path):

@@ -1,4 +1,4 @@
-"""How accurate the rows are, on simulated vineyards of every kind: ``python -m vinemap.accuracy [FAMILY ...]``.
+"""How accurate rows and canopies are, on simulated vineyards of every kind: ``python -m vinemap.accuracy [FAMILY …]``.
 
 Every family of ``vinemap.scenes`` is simulated with a few seeds and mapped in memory, without a boundary and with the
 settings as they come. What misses its bar is marked with "!". Of the worst row of each family a picture is drawn.
@@ -10,22 +10,23 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 import numpy as np
 import pandas as pd
 import shapely
 
+from vinemap.canopy_accuracy import CanopyErrors, compare_canopies, pool_canopies
 from vinemap.cloud import PointCloud
-from vinemap.config import Settings
+from vinemap.config import PolygonOptions, Settings
 from vinemap.evaluate import evaluate_rows
-from vinemap.parcel import RowMap, map_rows
+from vinemap.parcel import RowMap, map_rows, model_canopies
 from vinemap.raster import Raster, RowField, cell_of, sample
 from vinemap.scenes import FAMILIES, family
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import geopandas as gpd
     from matplotlib.axes import Axes
@@ -75,7 +76,8 @@ class Worst(NamedTuple):
 class Measure(NamedTuple):
     """A number of the table, and the bar that it must meet."""
 
-    value: Callable[[Errors], float]
+    value: Callable[[Any], float]
+    """Of :class:`Errors` or :class:`CanopyErrors`."""
     bar: float
     digits: int = 3
     at_least: bool = False
@@ -92,7 +94,12 @@ def quantile(values: ArrayLike, order: float) -> float:
 
 
 ALONG = ["e1_along_m", "en_along_m"]
-COLUMNS: dict[str, dict[str, Measure]] = {
+Columns = dict[str, dict[str, Measure]]
+COLUMNS: Columns = {
+    "rows": {
+        "true": Measure(lambda e: e.rows, np.inf, 0),
+        "found": Measure(lambda e: e.found, np.inf, 0),
+    },
     "rows %": {
         "good": Measure(lambda e: 100 * len(e.pairs) / e.rows if e.rows else np.nan, 100, 1, at_least=True),
         "extra": Measure(lambda e: 100 * (e.found - len(e.pairs)) / max(e.rows, 1), 0, 1),
@@ -129,7 +136,30 @@ COLUMNS: dict[str, dict[str, Measure]] = {
         "length m": Measure(lambda e: quantile(e.gap_length, 0.5), 0.3, 2),
     },
 }
-"""Numbers of the table, by heading and name."""
+"""Numbers of the table of rows, by heading and name."""
+CANOPY_COLUMNS: Columns = {
+    "against the true foliage": {
+        "G": Measure(lambda e: mean(e.good), 0.93, at_least=True),
+        "U": Measure(lambda e: mean(e.under), 0.07),
+        "O": Measure(lambda e: mean(e.over), 0.18),
+        "G − U − O": Measure(lambda e: mean(e.good) - mean(e.under) - mean(e.over), 0.70, at_least=True),
+    },
+    "the thesis's feet": {"G − U − O": Measure(lambda e: mean(e.soil), -np.inf, at_least=True)},
+    "against the points' outline": {"O": Measure(lambda e: mean(e.hull_over), 0.09)},
+    "height m": {
+        "mean": Measure(lambda e: mean(e.height), 0.05),
+        "worst row": Measure(lambda e: quantile(np.abs(e.height), 1), 0.05),
+    },
+    "width m": {
+        "mean": Measure(lambda e: mean(e.width), 0.05),
+        "worst row": Measure(lambda e: quantile(np.abs(e.width), 1), 0.05),
+    },
+    "volume %": {
+        "mean": Measure(lambda e: 100 * mean(e.volume), 12, 1),
+        "worst row": Measure(lambda e: 100 * quantile(np.abs(e.volume), 1), 12, 1),
+    },
+}
+"""Numbers of the table of canopies."""
 EASED = {("thin", "DEP m", "mean"): 0.10, ("terraces", "DTM m", "median"): 0.03, ("terraces", "DTM m", "95%"): 0.20}
 """Bars that are lower for a family."""
 
@@ -233,17 +263,22 @@ def _gap_errors(survey: Survey, gaps: gpd.GeoDataFrame) -> tuple[NDArray[np.bool
     return recalled, right, np.array(errors)
 
 
-def measure(name: str, seeds: int, out: Path | None = None) -> Errors:
+def measure(name: str, seeds: int, out: Path | None = None) -> tuple[Errors, CanopyErrors]:
     """Errors over all seeds of a family; draws its worst row into a folder."""
-    cases = []
+    cases, canopies = [], []
+    ours, thesis = Settings(), Settings(polygon=PolygonOptions(foot="soil"))
     for seed in range(seeds):
         survey = family(name, seed)
-        found = map_rows(PointCloud(survey.xyz, survey.rows.crs), Settings())
-        cases.append((*compare(survey, found), survey, found, f"{name}, seed {seed}"))
+        points = PointCloud(survey.xyz, survey.rows.crs)
+        found = map_rows(points, ours)
+        errors, worst = compare(survey, found)
+        model, on_soil = (model_canopies(points, found, settings) for settings in (ours, thesis))
+        canopies.append(compare_canopies(survey, found, model, on_soil, errors.pairs, step=ours.sections.step))
+        cases.append((errors, worst, survey, found, f"{name}, seed {seed}"))
     if out:
         _, worst, survey, found, title = max(cases, key=lambda case: case[1].badness if case[1] else 0.0)
         draw(worst, survey, found, title, out / f"{name}.png")
-    return pool([errors for errors, *_ in cases])
+    return pool([errors for errors, *_ in cases]), pool_canopies(canopies)
 
 
 def draw(worst: Worst | None, survey: Survey, found: RowMap, title: str, path: Path) -> None:
@@ -306,18 +341,17 @@ def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: Row
     axes.set(xlabel="along the row (m)", ylabel="to its left (m)")
 
 
-def table(results: dict[str, Errors]) -> list[list[str]]:
-    """Lines of the table of accuracy, headings first: a line a family, "!" after what misses its bar."""
-    heads = [f"{heading}: {', '.join(measures)}" for heading, measures in COLUMNS.items()]
-    lines = [["family", "rows: true, found", *heads]]
+def table(results: Mapping[str, Errors | CanopyErrors], columns: Columns = COLUMNS) -> list[list[str]]:
+    """Lines of a table of accuracy, headings first: a line a family, "!" after what misses its bar."""
+    lines = [["family", *[f"{heading}: {', '.join(measures)}" for heading, measures in columns.items()]]]
     for name, errors in results.items():
         cells = [
             ", ".join(
                 _cell(measure.value(errors), measure, EASED.get((name, heading, key))) for key, measure in m.items()
             )
-            for heading, m in COLUMNS.items()
+            for heading, m in columns.items()
         ]
-        lines.append([name, f"{errors.rows}, {errors.found}", *cells])
+        lines.append([name, *cells])
     return lines
 
 
@@ -343,31 +377,38 @@ def as_text(lines: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
-MARKS = "<!-- accuracy -->", "<!-- /accuracy -->"
-"""What stands before and after the table in a Markdown file."""
+def fill(text: str, name: str, lines: Sequence[Sequence[str]]) -> str:
+    """Markdown whose table between ``<!-- name -->`` and ``<!-- /name -->`` is replaced."""
+    before, mark, rest = text.partition(f"<!-- {name} -->")
+    _, end, after = rest.partition(f"<!-- /{name} -->")
+    return f"{before}{mark}\n{as_markdown(lines)}\n{end}{after}" if mark and end else text
 
 
 @click.command()
 @click.argument("families", nargs=-1, type=click.Choice(list(FAMILIES)), metavar="[FAMILY]...")
 @click.option("--seeds", default=3, show_default=True, type=click.IntRange(1), help="Surveys of each family.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for a picture of each family's worst row.")
-@click.option("--markdown", is_flag=True, help="Print the table as Markdown.")
-@click.option("--readme", type=click.Path(path_type=Path), help="Markdown file whose table between marks is filled.")
+@click.option("--markdown", is_flag=True, help="Print the tables as Markdown.")
+@click.option("--readme", type=click.Path(path_type=Path), help="Markdown file whose tables between marks are filled.")
 def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool, readme: Path | None) -> None:
-    """Measure the accuracy of the rows on simulated vineyards, of all families unless some are named."""
+    """Measure rows and canopies on simulated vineyards, of all families unless some are named."""
     names = families or tuple(FAMILIES)
     began = time.perf_counter()
     with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool_:
         jobs = {name: pool_.submit(measure, name, seeds, out) for name in names}
         results = {name: job.result() for name, job in jobs.items()}
-    lines = table(results)
-    click.echo(as_markdown(lines) if markdown else as_text(lines))
+    tables = {
+        "rows": table({name: rows for name, (rows, _) in results.items()}),
+        "canopies": table({n: c for n, (_, c) in results.items() if len(c.good)}, CANOPY_COLUMNS),
+    }
+    for lines in tables.values():
+        click.echo((as_markdown if markdown else as_text)(lines) + "\n")
     if readme:
-        before, _, after = (text := readme.read_text(encoding="utf-8")).partition(MARKS[0])
-        if MARKS[0] in text and MARKS[1] in after:
-            after = after.partition(MARKS[1])[2]
-            readme.write_text(f"{before}{MARKS[0]}\n{as_markdown(lines)}\n{MARKS[1]}{after}", encoding="utf-8")
-    missed = sum(cell.count("!") for line in lines[1:] for cell in line)
+        text = readme.read_text(encoding="utf-8")
+        for name, lines in tables.items():
+            text = fill(text, name, lines)
+        readme.write_text(text, encoding="utf-8")
+    missed = sum(cell.count("!") for lines in tables.values() for line in lines[1:] for cell in line)
     click.echo(
         f"{missed} values miss their bars (!); surveys: {len(names) * seeds}, in {time.perf_counter() - began:.0f} s",
         err=True,

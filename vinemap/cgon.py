@@ -109,7 +109,11 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
     section = as_complex(points)
     offsets = _checked(start, len(section), 0.0)
     fixed, out = as_complex(feet).reshape(-1, 3), np.asarray(reach, dtype=float)
-    outline, first = _grow_all(section, offsets, fixed, out)
+    room = offsets + 2 * np.arange(len(offsets))
+    outline, size = np.empty(2 * room[-1], dtype=np.complex128), np.zeros(len(fixed), dtype=np.int64)
+    in_threads(lambda part: _grow_all(*part, section, offsets, fixed, out, outline, size), stretches(len(size)))
+    first = np.concatenate([[0], np.cumsum(size)])
+    outline = outline[np.arange(first[-1]) + np.repeat(2 * room[:-1] - first[:-1], size)]
     left = np.where(fixed[:, 1].real >= fixed[:, 2].real, 0.5, -0.5)
     moved = fixed + out[:, None] * np.stack([0 * left - 1j, left - 1j, -left - 1j], axis=1)
     return as_pairs(outline), first, as_pairs(moved)
@@ -630,23 +634,22 @@ def _peel_all(
 
 
 @compiled
-def _grow_all(points: Points, start: Ints, feet: Points, reach: Floats) -> tuple[Points, Ints]:
-    first = np.zeros(len(start), dtype=np.int64)
-    out = np.empty(2 * (len(points) + 2 * len(feet)), dtype=np.complex128)
-    size = 0
-    for k in range(len(feet)):
+def _grow_all(
+    first: int, last: int, points: Points, start: Ints, feet: Points, reach: Floats, out: Points, sizes: Ints
+) -> None:
+    """Write the outlines' vertices, twice as many as a section's points and feet at the most, and how many they are."""
+    for k in range(first, last):
         n = start[k + 1] - start[k]
         body = np.empty(n + 2, dtype=np.complex128)
         body[:n], body[n], body[n + 1] = points[start[k] : start[k + 1]], feet[k, 1], feet[k, 2]
         body = body[_sorted(body)]
         ring = body[_hull(body)]
+        at = 2 * (start[k] + 2 * k)
         for i in range(len(ring)):
             edge = ring[i] - ring[i - 1]
             outward = -1j * edge / abs(edge) * reach[k] if edge != 0 else 0j
-            out[size], out[size + 1] = ring[i - 1] + outward, ring[i] + outward
-            size += 2
-        first[k + 1] = size
-    return out[:size], first
+            out[at + 2 * i], out[at + 2 * i + 1] = ring[i - 1] + outward, ring[i] + outward
+        sizes[k] = 2 * len(ring)
 
 
 @compiled

@@ -49,6 +49,8 @@ def commands() -> None:
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
 @click.option("--origin", type=_Origin(), help="Origin of the local frame {Main}; the parcel's corner by default.")
 @click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+@click.option("--classified", is_flag=True, help="Write the cloud with a class and a row for every point, too.")
+@click.option("--plain", is_flag=True, help="Write meshes for readers of glTF that know no extension: larger files.")
 def run(
     cloud: Path,
     boundary: Path | None,
@@ -57,17 +59,21 @@ def run(
     out: Path | None,
     origin: Any,
     settings: Path | None,
+    classified: bool,
+    plain: bool,
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
     from vinemap import paths
-    from vinemap.config import check_name, load_settings
+    from vinemap.config import Settings, check_name, load_settings
     from vinemap.crs import parse_crs
 
     name = check_name(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
+    chosen = load_settings(settings) if settings else Settings()
+    extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}
     options = {
         "crs": parse_crs(crs) if crs else None,
-        "settings": load_settings(settings) if settings else None,
+        "settings": chosen.model_copy(update={"product": chosen.product.model_copy(update=extra)}),
         "boundary": boundary,
         "origin": origin,
         "named": parcel is not None,

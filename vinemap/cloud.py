@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 from vinemap.errors import InputError
 
@@ -74,8 +75,12 @@ class Sections(NamedTuple):
 
     def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_]) -> Sections:
         """The points (n,) and sections (m,) that are flagged; no point of a section that isn't may be."""
-        before = np.concatenate([[0], np.cumsum(points)])
-        start = np.concatenate([[0], np.cumsum(np.diff(before[self.start])[sections])])
+        n = np.zeros(len(sections), dtype=np.int64)
+        in_threads(lambda part: _count_flags(*part, points, self.start, n), stretches(len(n)))
+        before = np.concatenate([[0], np.cumsum(n)])
+        index = np.empty(before[-1], dtype=np.int64)
+        in_threads(lambda part: _find_flags(*part, points, self.start, before, index), stretches(len(n)))
+        start = np.concatenate([[0], np.cumsum(n[sections])])
         return Sections(
             self.row_id[sections],
             self.position[sections],
@@ -83,10 +88,36 @@ class Sections(NamedTuple):
             self.tangent[sections],
             self.spacing[sections],
             start,
-            self.points[points],
-            self.height[points],
-            self.member[points],
+            self.points[index],
+            self.height[index],
+            self.member[index],
         )
+
+
+@compiled
+def _count_flags(
+    first: int, last: int, flags: NDArray[np.bool_], start: NDArray[np.int64], n: NDArray[np.int64]
+) -> None:
+    for k in range(first, last):
+        for p in range(start[k], start[k + 1]):
+            n[k] += flags[p]
+
+
+@compiled
+def _find_flags(
+    first: int,
+    last: int,
+    flags: NDArray[np.bool_],
+    start: NDArray[np.int64],
+    before: NDArray[np.int64],
+    index: NDArray[np.int64],
+) -> None:
+    for k in range(first, last):
+        at = before[k]
+        for p in range(start[k], start[k + 1]):
+            if flags[p]:
+                index[at] = p
+                at += 1
 
 
 def read_cloud(
@@ -127,6 +158,37 @@ def read_cloud(
     except Exception as error:  # laspy and lazrs raise many kinds, a Rust panic among them
         reason = str(error).strip().split("\n")[0] or type(error).__name__
         raise InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?") from error
+
+
+def write_classified(
+    cloud: PointCloud, heights: Values, classes: NDArray[np.uint8], row_id: NDArray[np.uint16], path: Path
+) -> None:
+    """Write a LAZ file (LAS 1.4) of points with ``Classification``, ``HeightAboveGround`` (m) and ``row_id``.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(cloud.xyz.min(axis=0))
+    header.add_crs(cloud.crs)
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams("HeightAboveGround", "float32", "metres above the terrain model"),
+            laspy.ExtraBytesParams("row_id", "uint16", "vine row, 0 for none"),
+        ]
+    )
+    out = laspy.LasData(header)
+    out.x, out.y, out.z = cloud.xyz.T
+    out.classification = classes
+    out["HeightAboveGround"] = heights.astype(np.float32)
+    out["row_id"] = row_id
+    with path.open("wb") as stream:
+        out.write(stream, do_compress=True, laz_backend=laspy.LazBackend.LazrsParallel)
 
 
 def _backends(path: Path) -> Any:

@@ -156,6 +156,13 @@ class PolygonOptions(Options):
     foot: Literal["foliage", "soil"] = Field("foliage", description="where v1, v2 and vc stand; the thesis's: soil")
 
 
+class ProductOptions(Options):
+    """What a product holds beside the usual."""
+
+    classified: bool = Field(default=False, description="the cloud with a class and a row for every point, as LAZ")
+    plain: bool = Field(default=False, description="meshes for readers of glTF that know no extension: larger files")
+
+
 class Settings(Options):
     """Settings of every stage."""
 
@@ -170,6 +177,7 @@ class Settings(Options):
     sections: SectionOptions = SectionOptions()
     canopy: CanopyOptions = CanopyOptions()
     polygon: PolygonOptions = PolygonOptions()
+    product: ProductOptions = ProductOptions()
 
 
 class SurveyConfig(Options):

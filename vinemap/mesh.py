@@ -20,11 +20,21 @@ if TYPE_CHECKING:
 
     Vertices = NDArray[np.float64]
     Faces = NDArray[np.int64]
+    Lofted = tuple[Vertices, Faces, tuple["Piece", ...]]
 
 Z_UP_TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion (x, y, z, w) that takes x east, y north, z up to glTF's x east, y up, z south."""
 GREEN = [0.13, 0.33, 0.07, 1.0]
 """Linear RGBA of foliage."""
+
+
+class Piece(NamedTuple):
+    """How a closed piece's vertices lie: section after section, corner after corner."""
+
+    sections: int
+    corners: int
+    turned: bool
+    """Whether the polygons turn so that Eq. 22's triangles had to be reversed to face outward."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +45,8 @@ class Mesh:
     """(n, 3) x east, y north, z up, m, in the parcel's metric CRS."""
     faces: Faces
     """(m, 3) indices of vertices."""
+    pieces: tuple[Piece, ...] = ()
+    """The lofted pieces that vertices and faces consist of, in their order; none for other meshes."""
     row_id: int = 0
     label: str = ""
     """Name of the row, "1 F"."""
@@ -52,7 +64,7 @@ class Audit(NamedTuple):
     """m³; NaN where not watertight."""
 
 
-def loft(polygons: ArrayLike) -> tuple[Vertices, Faces]:
+def loft(polygons: ArrayLike) -> Lofted:
     """Join consecutive sections' polygons to a closed piece.
 
     Parameters
@@ -66,6 +78,8 @@ def loft(polygons: ArrayLike) -> tuple[Vertices, Faces]:
         The polygons' own.
     faces : ndarray of shape (2 * c * k - 4, 3)
         Eq. 22 with the index wrapped, section after section, then the caps; outward, whichever way the polygons turn.
+    pieces : tuple of Piece
+        The one.
 
     Raises
     ------
@@ -76,27 +90,25 @@ def loft(polygons: ArrayLike) -> tuple[Vertices, Faces]:
     if sections.ndim != 3 or sections.shape[0] < 2 or sections.shape[1] < 3 or sections.shape[2] != 3:
         raise ValueError(f"polygons have shape {sections.shape}: give (k, c, 3) with k >= 2 and c >= 3")
     k, c = sections.shape[:2]
-    sides = (_ring(c) + c * np.arange(k - 1)[:, None, None]).reshape(-1, 3)
-    faces = np.concatenate([sides, _cap(sections[0])[:, ::-1], _cap(sections[-1]) + c * (k - 1)])
-    vertices = sections.reshape(-1, 3)
-    return vertices, faces if _volume(vertices, faces) >= 0 else faces[:, ::-1]
-
-
-def _ring(c: int) -> Faces:
-    """Triangles (2 * c, 3) of Eq. 22 from one section's vertices, 0 to c - 1, to the next one's, c to 2 * c - 1."""
     i = np.arange(c)
     j = (i + 1) % c
-    return np.concatenate([np.column_stack([i, j, i + c]), np.column_stack([j, j + c, i + c])])
+    ring = np.concatenate([np.column_stack([i, j, i + c]), np.column_stack([j, j + c, i + c])])
+    sides = (ring + c * np.arange(k - 1)[:, None, None]).reshape(-1, 3)
+    faces = np.concatenate([sides, _cap(sections[0])[:, ::-1], _cap(sections[-1]) + c * (k - 1)])
+    vertices = sections.reshape(-1, 3)
+    turned = _volume(vertices, faces) < 0
+    return vertices, faces[:, ::-1] if turned else faces, (Piece(k, c, turned),)
 
 
-def merge(pieces: Iterable[tuple[Vertices, Faces]]) -> tuple[Vertices, Faces]:
-    """The pieces of a row (it breaks at gaps) as one list of vertices (n, 3) and one of faces (m, 3)."""
-    vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], 0
-    for points, triangles in pieces:
+def merge(parts: Iterable[Lofted]) -> Lofted:
+    """The pieces of a row (it breaks at gaps) as one list of vertices (n, 3), one of faces (m, 3) and one of pieces."""
+    vertices, faces, pieces, total = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)], list[Piece](), 0
+    for points, triangles, shapes in parts:
         vertices.append(points)
         faces.append(triangles + total)
+        pieces += shapes
         total += len(points)
-    return np.concatenate(vertices), np.concatenate(faces)
+    return np.concatenate(vertices), np.concatenate(faces), tuple(pieces)
 
 
 def volume(mesh: Mesh) -> float:
@@ -157,14 +169,15 @@ def write_glb(
     extras: Mapping[str, Any] | None = None,
     plain: bool = False,
 ) -> None:
-    """Write rows as binary glTF: metres, Y up, one node and one primitive a row.
+    """Write rows as binary glTF: metres, Y up, one node and one mesh a row.
 
     The root node turns Z up to Y up and holds ``crs`` and ``origin`` in its extras; each row's node, named by its
     label, is moved to the row's middle. Faces are shaded flat (no normals).
 
     Positions are 16-bit steps of 1/65534 of the row's longest side, 1.8 mm in 120 m, that the node scales to metres
-    (KHR_mesh_quantization). Faces are a triangle strip wherever it is shorter than their list; it holds triangles
-    without area, that readers which look at the topology must drop.
+    (KHR_mesh_quantization). Each lofted piece is a primitive, a triangle strip that closes it without triangles of
+    repeated vertices; it splits the quadrilaterals along one diagonal or the other, and joins each section's last
+    corner to the next one's first. Other meshes are lists of triangles.
 
     Parameters
     ----------
@@ -179,8 +192,8 @@ def write_glb(
     extras : mapping, optional
         More for the root node: vertical datum ("vertical"), parcel, survey.
     plain : bool
-        Write float32 positions, to micrometres, and lists of triangles, for readers that know no extensions: a file
-        twice as large.
+        Write float32 positions, to micrometres, and one list of triangles a row, the mesh's own faces, for readers
+        that know no extensions: a file twice as large.
 
     References
     ----------
@@ -205,43 +218,43 @@ def write_glb(
         if len(mesh.faces) == 0:
             continue
         middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-        local, order, mode = (mesh.vertices - middle).astype("<f4"), mesh.faces.ravel(), gltf.TRIANGLES
         node.translation = (middle - zero).tolist()
         node.mesh = len(out.meshes)
+        local, pieces = (mesh.vertices - middle).astype("<f4"), () if plain else mesh.pieces
         if not plain:
             local, step = _quantise(mesh.vertices - middle)
             node.scale = [step] * 3
-            strip = _strip(mesh.faces)
-            if len(strip) < len(order):
-                order, mode = strip, gltf.TRIANGLE_STRIP
-        # 65535 is the primitive restart value.
-        kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(local) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
-        drawn = order.astype(kind).tobytes()
-        if drawn not in stored:
-            stored[drawn] = len(out.accessors)
-            indices += b"\0" * (-len(indices) % 4)
+        ends = np.cumsum([piece.sections * piece.corners for piece in pieces])
+        orders = [_strip(*piece) for piece in pieces] or [mesh.faces.ravel()]
+        mode, primitives = gltf.TRIANGLE_STRIP if pieces else gltf.TRIANGLES, []
+        for points, order in zip(np.split(local, ends[:-1]), orders, strict=True):
+            # 65535 is the primitive restart value.
+            kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(points) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
+            drawn = order.astype(kind).tobytes()
+            if drawn not in stored:
+                stored[drawn] = len(out.accessors)
+                indices += b"\0" * (-len(indices) % 4)
+                out.accessors.append(
+                    gltf.Accessor(
+                        bufferView=1, byteOffset=len(indices), componentType=code, count=len(order), type=gltf.SCALAR
+                    )
+                )
+                indices += drawn
             out.accessors.append(
                 gltf.Accessor(
-                    bufferView=1, byteOffset=len(indices), componentType=code, count=len(order), type=gltf.SCALAR
+                    bufferView=0,
+                    byteOffset=len(positions),
+                    componentType=gltf.FLOAT if plain else gltf.SHORT,
+                    count=len(points),
+                    type=gltf.VEC3,
+                    min=points[:, :3].min(axis=0).tolist(),
+                    max=points[:, :3].max(axis=0).tolist(),
                 )
             )
-            indices += drawn
-        out.accessors.append(
-            gltf.Accessor(
-                bufferView=0,
-                byteOffset=len(positions),
-                componentType=gltf.FLOAT if plain else gltf.SHORT,
-                count=len(local),
-                type=gltf.VEC3,
-                min=local[:, :3].min(axis=0).tolist(),
-                max=local[:, :3].max(axis=0).tolist(),
-            )
-        )
-        positions += local.tobytes()
-        primitive = gltf.Primitive(
-            attributes=gltf.Attributes(POSITION=len(out.accessors) - 1), indices=stored[drawn], material=0, mode=mode
-        )
-        out.meshes.append(gltf.Mesh(name=mesh.label, primitives=[primitive]))
+            positions += points.tobytes()
+            attributes = gltf.Attributes(POSITION=len(out.accessors) - 1)
+            primitives.append(gltf.Primitive(attributes=attributes, indices=stored[drawn], material=0, mode=mode))
+        out.meshes.append(gltf.Mesh(name=mesh.label, primitives=primitives))
     root.children = list(range(1, len(out.nodes)))
     if out.meshes:
         if not plain:
@@ -281,31 +294,21 @@ def _quantise(centred: Vertices) -> tuple[NDArray[np.int16], float]:
     return np.pad(np.rint(centred / step), [(0, 0), (0, 1)]).astype("<i2"), step
 
 
-def _strip(faces: Faces) -> NDArray[np.int64]:
-    """One triangle strip (n,) of all faces: lofted pieces' sides lengthwise, 2 indices a quadrilateral, others singly.
+def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
+    """One triangle strip (2 * k * c - 2,) that closes a piece of k sections of c corners, outward.
 
-    Every part repeats its ends, so that only triangles without area join it to the next, and has an even length, so
-    that the next is turned as it is.
+    From vertex n to n + c and back it winds up the sides, where each section's last corner is followed by the next
+    one's first; below the first vertex and above the last it folds back, and zigzags across the caps.
     """
-    single = [0, 0, 1, 2, 2, 2]
-    parts = []
-    while len(faces):
-        start, c = faces[0].min(), max(int(np.ptp(faces[0])), 3)
-        turned = faces[0, 0] > faces[0, 2]
-        ring = start + (_ring(c)[:, ::-1] if turned else _ring(c))
-        rings = faces[: len(faces) // len(ring) * len(ring)].reshape(-1, *ring.shape)
-        lofted = (rings == ring + c * np.arange(len(rings))[:, None, None]).all(axis=(1, 2))
-        n = int(np.argmin([*lofted, False]))
-        if n == 0:
-            break
-        section = start + np.arange((n + 1) * c).reshape(n + 1, c)
-        strips = np.stack([section, np.roll(section, -1, axis=1)], axis=2).swapaxes(0, 1).reshape(c, -1)
-        # Repeated once more, the first index turns the strip over.
-        parts.append(np.pad(strips, [(0, 0), (2, 2) if turned else (1, 1)], mode="edge").ravel())
-        sides, caps = n * len(ring), 2 * (c - 2)
-        parts.append(faces[sides : sides + caps, single].ravel())
-        faces = faces[sides + caps :]
-    return np.concatenate([*parts, faces[:, single].ravel()])[1:-1]
+    last, over = sections * corners - 1, corners // 2
+    n = np.arange(-over, last - corners + over + 1)
+    strip = np.column_stack([abs(n), last - abs(last - corners - n)]).ravel()
+    if corners % 2 == 0:
+        strip = strip[1:-1]  # where it folds there is one vertex, not two
+    if turned != (corners % 2 == 1):
+        corner = strip % corners
+        strip += -corner % corners - corner
+    return strip
 
 
 def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:

@@ -15,7 +15,8 @@ from vinemap import __version__, paths
 from vinemap.blocks import group_blocks
 from vinemap.canopy import find_feet, foliage_reach, section_meshes, separate_canopy
 from vinemap.cgon import enclose, grow, peel_sections
-from vinemap.cloud import PointCloud, Sections, read_cloud
+from vinemap.classification import classify_points
+from vinemap.cloud import PointCloud, Sections, read_cloud, write_classified
 from vinemap.clustering import cluster_rows
 from vinemap.confidence import judge_rows
 from vinemap.config import Settings, check_name
@@ -62,6 +63,7 @@ STAGES = (
     "Canopy",
     "Mesh",
     "Writing",
+    "Classification",
 )
 
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
@@ -169,7 +171,6 @@ def map_parcel(
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
-    options = settings.model_dump()
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
@@ -180,8 +181,7 @@ def map_parcel(
             )
         found = map_rows(points, settings, step=run)
         heights, rows, gaps = found.heights, found.rows, found.gaps
-        sections = run("Sections", cut_sections, points, heights, rows, gaps, found.dtm, **options["sections"])
-        canopy, outlines, table = run("Canopy", _model_canopy, sections, settings, points.crs)
+        canopy, outlines, table, leaves = model_canopies(points, found, settings, step=run)
         origin = origin or _corner(found.dtm)
         rows, ends, enhanced = describe_rows(
             summarise_rows(rows, table, step=settings.sections.step),
@@ -199,7 +199,10 @@ def map_parcel(
             "parcel": parcel_layer(parcel, rows, polygon, points),
         }
         chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
-        run("Writing", write_product, draft, parcel, layers, (found.dtm, chm), found.field, meshes, points)
+        surfaces, plain = (found.dtm, chm), settings.product.plain
+        run("Writing", write_product, draft, parcel, layers, surfaces, found.field, meshes, points, plain=plain)
+        if settings.product.classified:
+            run("Classification", _write_classified, draft, parcel, points, heights, leaves)
         counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
@@ -222,12 +225,32 @@ def map_parcel(
     return Summary(parcel, folder, len(rows), float(rows["length_m"].sum()), time.perf_counter() - began)
 
 
-def _model_canopy(
-    sections: Sections, settings: Settings, crs: CRS
-) -> tuple[Sections, NDArray[np.float64], gpd.GeoDataFrame]:
-    """Canopy points of every section, their c-gons (m, c, 2), and the table of sections."""
-    canopy, soil = separate_canopy(sections, **settings.canopy.model_dump())
-    canopy, feet = find_feet(canopy)
+class CanopyModel(NamedTuple):
+    """Canopies of a cloud's rows as polygons across them."""
+
+    canopy: Sections
+    """m sections with their canopy points."""
+    polygons: NDArray[np.float64]
+    """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
+    table: gpd.GeoDataFrame
+    """The sections in numbers."""
+    leaves: Sections
+    """Sections with all canopy points, before outliers are peeled off."""
+
+
+def model_canopies(
+    points: PointCloud, found: RowMap, settings: Settings, *, step: Callable[..., Any] = call
+) -> CanopyModel:
+    """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
+    options = settings.sections.model_dump()
+    sections = step("Sections", cut_sections, points, found.heights, found.rows, found.gaps, found.dtm, **options)
+    model: CanopyModel = step("Canopy", _model_canopy, sections, settings, points.crs)
+    return model
+
+
+def _model_canopy(sections: Sections, settings: Settings, crs: CRS) -> CanopyModel:
+    leaves, soil = separate_canopy(sections, **settings.canopy.model_dump())
+    canopy, feet = find_feet(leaves)
     peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
     canopy = canopy.subset(peeled.kept, np.ones(len(feet), dtype=bool))
     reach = foliage_reach(canopy, peeled.area, peeled.perimeter, peeled.vertices)
@@ -239,7 +262,15 @@ def _model_canopy(
     canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
     polygons, foliage = model.polygon[valid], model.hull_area[valid]
     indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
-    return canopy, polygons, measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
+    table = measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
+    return CanopyModel(canopy, polygons, table, leaves)
+
+
+def _write_classified(
+    folder: Path, parcel: str, points: PointCloud, heights: NDArray[np.floating], leaves: Sections
+) -> None:
+    classes, row_id = classify_points(points, heights, leaves)
+    write_classified(points, heights, classes, row_id, paths.classified_cloud(folder, parcel))
 
 
 def _corner(dtm: Raster) -> Origin:

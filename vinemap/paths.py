@@ -54,6 +54,11 @@ def canopy_mesh(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_canopy.glb"
 
 
+def classified_cloud(folder: Path, parcel: str) -> Path:
+    """Cloud of a parcel with a class and a row for every point."""
+    return folder / f"{parcel}_classified.laz"
+
+
 def run_record(folder: Path) -> Path:
     """Record of the run that made a product."""
     return folder / RUN

@@ -81,8 +81,12 @@ def write_product(
     field: RowField,
     meshes: list[Mesh],
     points: PointCloud,
+    *,
+    plain: bool = False,
 ) -> None:
-    """Write all files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
+    """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
+
+    ``plain`` meshes need no extension of glTF.
 
     Raises
     ------
@@ -107,6 +111,7 @@ def write_product(
         origin=tuple(np.round(centre).tolist()),
         crs=points.crs.to_string(),
         extras={"vertical": points.vertical},
+        plain=plain,
     )
 
 

@@ -98,9 +98,17 @@ def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.
     """How many points (m,) lie within reach of each position along a row, and which, section after section."""
     m = len(position)
     n = np.zeros(m, dtype=np.int64)
-    first = np.searchsorted(position, along - reach)
+    if m == 0:
+        return n, np.empty(0, dtype=np.int64)
+    step = (position[-1] - position[0]) / m + reach
+    table = np.searchsorted(position, position[0] + step * np.arange(int((position[-1] - position[0]) / step) + 2))
+    first = np.empty(len(along), dtype=np.int64)
     for p in range(len(along)):
-        k = first[p]
+        bin_ = int((along[p] - reach - position[0]) / step)
+        k = table[min(max(bin_, 0), len(table) - 1)]
+        while k < m and position[k] < along[p] - reach:
+            k += 1
+        first[p] = k
         while k < m and position[k] <= along[p] + reach:
             n[k] += 1
             k += 1

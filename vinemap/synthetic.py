@@ -77,6 +77,24 @@ class Obstacle:
     """Direction of its length, degrees anticlockwise from east."""
 
 
+class Foliage(NamedTuple):
+    """The canopy of all living stretches of rows at stations (n,), metres."""
+
+    row: NDArray[np.intp]
+    """Position of the row in the table of rows."""
+    xy: Array
+    """(n, 2) on the row's line."""
+    step: Array
+    """Length of row that the station stands for."""
+    top: Array
+    """Height above ground."""
+    bottom: Array
+    half_width: Array
+    """At the widest height."""
+    shift: Array
+    """Of the foliage's middle, to the left of the row."""
+
+
 class Survey(NamedTuple):
     """A simulated survey and its truth, in one projected CRS."""
 
@@ -93,6 +111,7 @@ class Survey(NamedTuple):
     parcels: gpd.GeoDataFrame
     """Polygons; name."""
     terrain: Terrain
+    foliage: Foliage
 
 
 class _Stations(NamedTuple):
@@ -218,7 +237,23 @@ def simulate(
         flyers = np.flatnonzero(rng.random(n) < floaters)
         points[flyers, 2] += rng.choice([-1, 1], len(flyers)) * rng.uniform(0.5, 8.0, len(flyers))
         clouds.append(points[leaf | (rng.random(n) >= hidden[cells])])
-    return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain)
+    return Survey(
+        name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain, _foliage(stations)
+    )
+
+
+def foliage_outlines(foliage: Foliage, *, n: int = 24) -> Array:
+    """Outlines (stations, 2 n, 2) of the foliage across its rows, leaves' reach included: metres left and above ground.
+
+    They run counter-clockwise for one who looks along the row with its left at his right.
+    """
+    relative = np.linspace(0, 1, n)
+    reach = EDGE / 2
+    width = foliage.half_width[:, None] * _bulge(relative) + reach
+    z = foliage.bottom[:, None] - reach + relative * (foliage.top - foliage.bottom + 2 * reach)[:, None]
+    left = np.stack([foliage.shift[:, None] + width, z], axis=2)
+    right = np.stack([foliage.shift[:, None] - width, z], axis=2)
+    return np.concatenate([left, right[:, ::-1]], axis=1)
 
 
 def write_survey(survey: Survey, folder: Path | str) -> Path:
@@ -327,6 +362,19 @@ def _grow(
     return _Stations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
+def _bulge(relative: Array) -> Array:
+    """Width of a canopy at relative heights, 0 at its bottom to 1 at its top, as a share of the greatest."""
+    off = (relative - 0.4) / np.where(relative > 0.4, 0.62, 0.6)
+    return np.sqrt(np.maximum(1 - off**2, 0))
+
+
+def _foliage(stations: _Stations) -> Foliage:
+    alive = stations.half_width > 0
+    row, xy, step = stations.row[alive], stations.xy[alive], stations.step[alive]
+    top, bottom = stations.top[alive], stations.bottom[alive]
+    return Foliage(row, xy, step, top, bottom, stations.half_width[alive], stations.shift[alive])
+
+
 def _truth(
     vineyards: Sequence[Vineyard], dead: Sequence[NDArray[np.bool_]], stations: _Stations, terrain: Terrain, crs: str
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -410,8 +458,7 @@ def _meet_leaves(
         cell = np.clip(nearest + np.rint((s + ahead * ds) * per_metre).astype(int), 0, last)
         base = stations.ground[cell] + stations.bottom[cell]
         relative = (z + up - base) / (stations.top[cell] - stations.bottom[cell])
-        bulge = (relative - 0.4) / np.where(relative > 0.4, 0.62, 0.6)
-        width = stations.half_width[cell] * np.sqrt(np.maximum(1 - bulge**2, 0))
+        width = stations.half_width[cell] * _bulge(relative)
         within = np.clip((width - np.abs(c + ahead * dc - stations.shift[cell])) / EDGE + 0.5, 0, 1)
         within[(relative < 0) | (relative >= 1)] = 0
         layer = (np.clip(relative, 0, 0.999) * LAYERS).astype(int)

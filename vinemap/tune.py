@@ -1,0 +1,176 @@
+"""Search of a model's [a, b, c] by its quality score, as in section 3.3: ``python -m vinemap.tune CLOUD``.
+
+Every model is held against the foliage's outlines in fine, fixed sections (V_ref of Table 3.1): between its own
+sections its mesh runs straight, so that sections far apart are paid for. R depends on the cloud's density alone, and
+Q compares models of one cloud only.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import click
+import numpy as np
+import shapely
+from scipy.optimize import differential_evolution
+
+from vinemap.cli import FILE, plain_errors
+from vinemap.cloud import read_cloud
+from vinemap.config import PolygonOptions, SectionOptions, Settings
+from vinemap.crs import parse_crs
+from vinemap.errors import InputError
+from vinemap.parcel import map_rows, model_canopies
+from vinemap.section_table import modelling_indices
+from vinemap.vector import read_boundary
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from vinemap.cloud import PointCloud
+    from vinemap.parcel import CanopyModel, RowMap
+
+    Values = NDArray[np.floating]
+
+BOUNDS = [(0.1, 1.0), (0.1, 2.0), (5, 11)]
+"""The thesis's ranges of a and b, in metres, and of c."""
+THESIS = (0.4, 0.25, 7)
+"""What the thesis found best."""
+REFERENCE = {"width": 0.4, "step": 0.1}
+"""Sections against which models are held."""
+OUTLINE = 30
+"""Vertices with which a polygon is as good as the foliage's outline."""
+LENGTH = 128.0
+"""Metres of rows that are enough for a search, as in the thesis."""
+
+
+class Score(NamedTuple):
+    """Indices of a model at every section of the reference (n,); R is the mean of the model's own sections."""
+
+    good: Values
+    under: Values
+    over: Values
+    reduction: float
+
+    @property
+    def quality(self) -> Values:
+        """Q (n,) of Eq. 23."""
+        return self.good - (self.under + self.over) + self.reduction
+
+
+def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b: float, c: int, foot: str) -> Score:
+    """Indices of the model [a, b, c] of the rows that were found."""
+    model = _model(points, found, {"width": a, "step": b}, c, foot)
+    polygons, known = _between(model, reference, reach=2.5 * b)
+    outlines = np.array(shapely.make_valid(shapely.polygons(reference.polygons)))
+    drawn = np.full(len(outlines), shapely.Polygon(), dtype=object)
+    drawn[known] = shapely.make_valid(shapely.polygons(polygons[known]))
+    shared, mine, area = (
+        np.asarray(shapely.area(shape)) for shape in (shapely.intersection(drawn, outlines), drawn, outlines)
+    )
+    reduction = float(model.table["reduction"].mean()) if len(model.table) else 0.0
+    return Score(*modelling_indices(shared, mine, area), reduction)
+
+
+def _model(points: PointCloud, found: RowMap, sections: dict[str, float], c: int, foot: str) -> CanopyModel:
+    settings = Settings(
+        sections=SectionOptions.model_validate(sections), polygon=PolygonOptions.model_validate({"c": c, "foot": foot})
+    )
+    return model_canopies(points, found, settings)
+
+
+def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tuple[Values, NDArray[np.bool_]]:
+    """Polygons (n, c, 2) of a model's mesh at the sections of the reference, and whether it has one there."""
+    mine, wanted = model.canopy, reference.canopy
+    out = np.full((len(wanted.row_id), *model.polygons.shape[1:]), np.nan)
+    for row_id in np.unique(mine.row_id):
+        own, there = np.flatnonzero(mine.row_id == row_id), np.flatnonzero(wanted.row_id == row_id)
+        position, at = mine.position[own], wanted.position[there]
+        after = np.clip(np.searchsorted(position, at), 1, max(len(own) - 1, 1))
+        if len(own) < 2:
+            continue
+        low, high = position[after - 1], position[after]
+        inside = (at >= low) & (at <= high) & (high - low <= reach)
+        part = ((at - low) / (high - low))[inside, None, None]
+        first, second = model.polygons[own[after - 1]][inside], model.polygons[own[after]][inside]
+        out[there[inside]] = (1 - part) * first + part * second
+    return out, np.asarray(np.isfinite(out).all(axis=(1, 2)))
+
+
+def search(points: PointCloud, found: RowMap, *, seed: int = 0, generations: int = 12) -> tuple[float, float, int]:
+    """The [a, b, c] of the highest mean Q within the thesis's ranges, by differential evolution."""
+    reference = _model(points, found, REFERENCE, OUTLINE, "foliage")
+
+    def loss(x: Values) -> float:
+        value = score(points, found, reference, float(x[0]), float(x[1]), round(float(x[2])), "foliage")
+        return -float(value.quality.mean())
+
+    best = differential_evolution(
+        loss,
+        BOUNDS,
+        integrality=[False, False, True],
+        seed=seed,
+        maxiter=generations,
+        popsize=6,
+        polish=False,
+        tol=1e-3,
+    ).x
+    return round(float(best[0]), 2), round(float(best[1]), 2), round(float(best[2]))
+
+
+def some_rows(found: RowMap, length: float) -> RowMap:
+    """The map with its longest rows only, of so many metres together."""
+    order = found.rows.length.sort_values(ascending=False)
+    chosen = order.index[order.cumsum().shift(fill_value=0.0) < length]
+    rows = found.rows.loc[sorted(chosen)]
+    return found._replace(rows=rows, gaps=found.gaps[found.gaps["row_id"].isin(rows["row_id"])])
+
+
+def draw(scores: dict[str, Score], path: Path) -> None:
+    """Draw the histograms of G, U, O and Q of models (Fig. 3.9)."""
+    from matplotlib.figure import Figure  # a tool of development
+
+    figure = Figure(figsize=(14, 3.2 * len(scores)), layout="constrained")
+    panels = figure.subplots(len(scores), 4, squeeze=False)
+    for line, (name, one) in zip(panels, scores.items(), strict=True):
+        for axes, key in zip(line, ("good", "under", "over", "quality"), strict=True):
+            values = getattr(one, key)
+            axes.hist(values, bins=np.linspace(-0.5 if key == "quality" else 0.0, 1.1, 56), color="tab:green")
+            axes.set_title(f"{name}: {key}, mean {values.mean():.3f}, σ {values.std():.3f}", fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+
+
+@click.command()
+@click.argument("cloud", type=FILE)
+@click.option("--boundary", type=FILE, help="Polygon to clip to.")
+@click.option("--parcel", help="Name of the polygon, where the file has several.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none.")
+@click.option("--length", default=LENGTH, show_default=True, help="Metres of rows to search with.")
+@click.option("--out", type=FILE, default=Path("build/tune.png"), show_default=True, help="Picture to draw.")
+def main(cloud: Path, boundary: Path | None, parcel: str | None, crs: str | None, length: float, out: Path) -> None:
+    """Search the [a, b, c] that models the canopies in CLOUD best."""
+    polygon = read_boundary(boundary, parcel=parcel) if boundary else None
+    points = read_cloud(cloud, crs=parse_crs(crs) if crs else None, boundary=polygon)
+    found = some_rows(map_rows(points, Settings()), length)
+    if len(found.rows) == 0:
+        raise InputError(f"{cloud}: no vine row found, so that there is no canopy to model")
+    best = search(points, found)
+    reference = _model(points, found, REFERENCE, OUTLINE, "foliage")
+    models = {"best": (*best, "foliage"), "the thesis's": (*THESIS, "foliage"), "on the soil": (*THESIS, "soil")}
+    scores = {}
+    for name, (a, b, c, foot) in models.items():
+        scores[f"{name} [{a:g}, {b:g}, {c}]"] = score(points, found, reference, a, b, c, foot)
+    for name, one in scores.items():
+        means = (values.mean() for values in (one.good, one.under, one.over))
+        click.echo(
+            f"{name}: " + "G {:.3f}, U {:.3f}, O {:.3f}, ".format(*means) + f"R {one.reduction:.3f}, "
+            f"Q {one.quality.mean():.3f} ± {one.quality.std():.3f}"
+        )
+    draw(scores, out)
+    click.echo(f"{len(found.rows)} rows, {found.rows.length.sum():.0f} m → {out}")
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(standalone_mode=False)
