@@ -12,7 +12,7 @@ import shapely.affinity
 import shapely.ops
 from click.testing import CliRunner
 
-from vinemap.accuracy import COLUMNS, as_markdown, as_text, compare, main, measure, pool, table
+from vinemap.accuracy import CANOPY_COLUMNS, COLUMNS, as_markdown, as_text, compare, fill, main, measure, pool, table
 from vinemap.parcel import RowMap
 from vinemap.raster import Grid, Raster, RowField
 from vinemap.scenes import hillside, rows_of
@@ -61,7 +61,13 @@ def moved(lines, step):
 
 def test_no_error_is_no_error(survey, perfect):
     errors, worst = compare(survey, perfect)
-    right = {("rows %", "good"): 100, ("gaps", "recall"): 1, ("gaps", "precision"): 1}
+    right = {
+        ("rows", "true"): 4,
+        ("rows", "found"): 4,
+        ("rows %", "good"): 100,
+        ("gaps", "recall"): 1,
+        ("gaps", "precision"): 1,
+    }
     for key, value in numbers(errors).items():
         assert value == pytest.approx(right.get(key, 0), abs=0.02 if key[0] in {"direction °", "DTM m"} else 1e-3), key
     assert worst.badness < 0.01
@@ -174,8 +180,19 @@ def test_tables_for_readers_and_for_markdown(survey, perfect):
     assert marked[1].startswith("| --- | --- |")
 
 
+def test_a_table_is_filled_between_its_marks():
+    text = "a <!-- rows -->old<!-- /rows --> b <!-- canopies --><!-- /canopies --> c"
+    assert fill(text, "rows", [["x"], ["1"]]) == (
+        "a <!-- rows -->\n| x |\n| --- |\n| 1 |\n<!-- /rows --> b <!-- canopies --><!-- /canopies --> c"
+    )
+    assert fill(text, "none", [["x"]]) == text
+
+
 def test_a_family_is_measured_and_drawn(tmp_path):
-    errors = measure("short", 1, tmp_path)
+    errors, canopy = measure("short", 1, tmp_path)
+    assert len(canopy.height) == len(errors.pairs)
+    assert len(canopy.good) > 200
+    assert "–" not in "".join(table({"short": canopy}, CANOPY_COLUMNS)[1])
     assert errors.rows >= 6
     assert len(errors.pairs) >= 0.8 * errors.rows
     assert (tmp_path / "short.png").read_bytes().startswith(b"\x89PNG")

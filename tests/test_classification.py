@@ -1,0 +1,69 @@
+"""Classes and rows of a cloud's points."""
+
+import laspy
+import numpy as np
+import pytest
+
+from vinemap.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
+from vinemap.cloud import PointCloud, write_classified
+from vinemap.config import Settings
+from vinemap.parcel import map_rows, model_canopies
+
+
+@pytest.fixture(scope="module")
+def classified(cloud):
+    """The vineyard with ten flyers far from all else, classified."""
+    middle = cloud.xyz.mean(axis=0)
+    flyers = middle + np.column_stack([np.linspace(-9, 9, 10), np.linspace(9, -9, 10), np.full(10, 12.0)])
+    flown = PointCloud(np.concatenate([cloud.xyz, flyers]), cloud.crs)
+    found = map_rows(flown, Settings())
+    leaves = model_canopies(flown, found, Settings()).leaves
+    return flown, found, *classify_points(flown, found.heights, leaves)
+
+
+def test_ground_canopy_and_noise(classified, vineyard):
+    flown, found, classes, _ = classified
+    assert set(classes) == {OTHER, GROUND, CANOPY, NOISE}
+    assert (classes[-10:] == NOISE).all()
+    assert (classes == NOISE).mean() < 0.005
+    x, y, z = flown.xyz.T
+    above = z - vineyard.terrain(x, y)
+    assert np.abs(above[classes == GROUND]).max() < 0.2
+    assert (classes[np.abs(above) < 0.05] == GROUND).mean() > 0.98
+    assert above[classes == CANOPY].min() > 0.3
+    # Nearly all that stands in the rows is canopy.
+    tall = (above > 0.7) & (above < 2.3)
+    assert (classes[tall] == CANOPY).mean() > 0.93
+    assert len(found.rows) == 6
+
+
+def test_canopy_knows_its_row(classified, vineyard):
+    flown, _, classes, row_id = classified
+    assert (row_id[classes != CANOPY] == 0).all()
+    assert set(row_id[classes == CANOPY]) == {1, 2, 3, 4, 5, 6}
+    for row, line in zip(vineyard.rows["row"], vineyard.rows.geometry, strict=True):
+        points = flown.xyz[row_id == row, :2]
+        (ax, ay, _), (bx, by, _) = line.coords[0], line.coords[-1]
+        off = np.abs((bx - ax) * (points[:, 1] - ay) - (by - ay) * (points[:, 0] - ax)) / np.hypot(bx - ax, by - ay)
+        assert off.max() < 1.0
+
+
+def test_a_cloud_without_canopy(cloud):
+    flat = PointCloud(cloud.xyz[:1000] * [1, 1, 0], cloud.crs)
+    found = map_rows(flat, Settings())
+    leaves = model_canopies(flat, found, Settings()).leaves
+    classes, row_id = classify_points(flat, found.heights, leaves)
+    assert (classes == GROUND).all()
+    assert (row_id == 0).all()
+
+
+def test_file_read_back(classified, tmp_path):
+    flown, found, classes, row_id = classified
+    path = tmp_path / "classified.laz"
+    write_classified(flown, found.heights, classes, row_id, path)
+    back = laspy.read(path)
+    assert np.abs(back.xyz - flown.xyz).max() < 0.001
+    assert (np.asarray(back.classification) == classes).all()
+    assert (np.asarray(back["row_id"]) == row_id).all()
+    assert np.abs(np.asarray(back["HeightAboveGround"]) - found.heights).max() < 1e-4
+    assert back.header.parse_crs().to_epsg() == 32632
