@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
-from shapely import Point, Polygon
+from shapely import MultiPoint, Point, Polygon
 
-from vinemap.cgon import enclose, hull, peel
+from vinemap.cgon import enclose, grow, hull, peel, peel_sections
 
 
 def cross(a, b, p):
@@ -343,3 +343,86 @@ def test_a_million_points():
     points = np.random.default_rng(0).random((1_000_000, 2))
     result = check(points, np.array([[0.5, -0.1], [1, -0.1], [0, -0.1]]), 7, 0.0001)
     assert result.area[0] == pytest.approx(1.1, abs=0.01)
+
+
+# Foliage's outlines
+
+
+def test_peeling_all_sections_is_peeling_each():
+    rng = np.random.default_rng(1)
+    sections = [canopy(rng, n)[0] if n else np.empty((0, 2)) for n in (2, 3, 40, 0, 150)]
+    sections[2][5] = np.nan
+    start = np.concatenate([[0], np.cumsum([len(p) for p in sections])])
+    peeled = peel_sections(np.concatenate(sections), start, share=0.05)
+    for k, points in enumerate(sections):
+        kept = peeled.kept[start[k] : start[k + 1]]
+        finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+        if len(finite) < 3:
+            assert np.isnan(peeled.area[k])
+            assert peeled.vertices[k] == 0
+            continue
+        gone = finite[peel(points[finite], int(np.ceil(0.05 * len(finite))))]
+        assert set(np.flatnonzero(~kept)) == set(gone) | set(np.flatnonzero(~np.isfinite(points).all(axis=1)))
+        shape = MultiPoint(points[kept]).convex_hull
+        assert peeled.area[k] == pytest.approx(shape.area)
+        assert peeled.perimeter[k] == pytest.approx(shape.length)
+        assert peeled.vertices[k] == len(shape.exterior.coords) - 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_foliage_grows_by_its_reach_on_all_sides(seed):
+    points, feet = canopy(np.random.default_rng(seed), 60)
+    outline, start, moved = grow(points, [0, len(points)], feet[None], [0.05])
+    body = MultiPoint(np.vstack([points, feet[1:]])).convex_hull
+    grown = MultiPoint(outline).convex_hull
+    assert start.tolist() == [0, len(outline)]
+    assert grown.covers(body)
+    # Sides move by the reach; corners are cut, never by more.
+    assert body.buffer(0.05, quad_segs=64).buffer(1e-4).covers(grown)
+    assert grown.exterior.distance(body) > 0.02
+    assert grown.area == pytest.approx(body.buffer(0.05).area, rel=0.03)
+    np.testing.assert_allclose(moved[0] - feet, [[0, -0.05], [0.025, -0.05], [-0.025, -0.05]], atol=1e-12)
+
+
+def test_no_reach_no_growth():
+    points, feet = canopy(np.random.default_rng(0), 60)
+    outline, _, moved = grow(points, [0, len(points)], feet[None], [0.0])
+    assert MultiPoint(outline).convex_hull.equals(MultiPoint(np.vstack([points, feet[1:]])).convex_hull)
+    assert (moved[0] == feet).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_sliding_feet_stand_where_the_area_is_least(seed):
+    rng = np.random.default_rng(seed)
+    points, feet = canopy(rng, 40)
+    feet[:] = [[0, feet[1, 1]], [0.15, feet[1, 1]], [-0.15, feet[1, 1]]]
+    outline, start, moved = grow(points, [0, len(points)], feet[None], [0.03])
+    slid = enclose(outline, start, moved, c=7, share=0, slide=True)
+    polygon, level = slid.polygon[0], moved[0, 0, 1]
+    np.testing.assert_allclose(polygon[[0, 1, -1], 1], level, atol=1e-9)
+    assert polygon[-1, 0] < polygon[0, 0] < polygon[1, 0]
+    assert Polygon(polygon).buffer(1e-9).covers(MultiPoint(outline))
+    # No pair of fixed feet on that line does better.
+    for left in np.linspace(polygon[1, 0] - 0.1, polygon[1, 0] + 0.1, 9):
+        for right in np.linspace(polygon[-1, 0] - 0.1, polygon[-1, 0] + 0.1, 9):
+            fixed = enclose(outline, start, [[moved[0, 0], [left, level], [right, level]]], c=7, share=0)
+            if Polygon(fixed.polygon[0]).buffer(1e-9).covers(MultiPoint(outline)):
+                assert fixed.area[0] >= slid.area[0] - 1e-9
+
+
+def test_feet_stay_where_no_edge_holds_v1():
+    points, feet = canopy(np.random.default_rng(0), 40)
+    feet[0, 1] -= 0.3
+    plain, slid = (one(points, feet, share=0, slide=slide) for slide in (False, True))
+    np.testing.assert_array_equal(plain.polygon, slid.polygon)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_shared_area_is_that_of_the_intersection(seed):
+    points, feet = canopy(np.random.default_rng(seed), 80)
+    result = one(points, feet)
+    body = MultiPoint(points[result.kept]).convex_hull
+    assert result.hull_area[0] == pytest.approx(body.area)
+    assert result.shared_area[0] == pytest.approx(
+        Polygon(result.polygon[0]).buffer(0).intersection(body).area, rel=1e-6
+    )

@@ -6,13 +6,18 @@ import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pyproj import CRS
 
-from vinemap.canopy import find_feet, separate_canopy
+from vinemap.canopy import find_feet, foliage_reach, separate_canopy
+from vinemap.cgon import peel_sections
 from vinemap.cloud import PointCloud, Sections
+from vinemap.config import Settings
 from vinemap.ground import height_above_ground, terrain_model
+from vinemap.parcel import model_sections
 from vinemap.raster import Grid, Raster
-from vinemap.section_table import measure_sections, quantile_of, summarise_rows
+from vinemap.section_table import complexity_reduction, measure_sections, modelling_indices, quantile_of, summarise_rows
 from vinemap.sections import cut_sections
 
 UTM = CRS.from_epsg(32632)
@@ -158,3 +163,110 @@ def test_quantile_of_each_section():
     for q in (0.02, 0.5, 0.985):
         expected = [np.quantile(values[a:b], q) if b > a else 0 for a, b in pairwise(start)]
         assert np.allclose(quantile_of(values, start, q), expected)
+
+
+def many_sections(points, *, spacing=2.5, step=0.25, member=None):
+    """Sections of one row with the points of each, on flat soil."""
+    m = len(points)
+    start = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
+    flat = np.concatenate(points) if m else np.empty((0, 2))
+    way = np.tile([1.0, 0], (m, 1))
+    position = step * np.arange(m)
+    origin = np.column_stack([position, np.zeros((m, 2))])
+    member = np.arange(len(flat)) if member is None else np.concatenate(member)
+    return Sections(np.ones(m, int), position, origin, way, np.full(m, spacing), start, flat, flat[:, 1], member)
+
+
+@pytest.mark.parametrize("n", [25, 60, 200, 800])
+def test_foliage_reaches_as_far_as_its_hulls_fall_short(n):
+    """Points drawn evenly from an ellipse of leaves: however few they are, its area comes out."""
+    rng = np.random.default_rng(n)
+    angle, radius = rng.uniform(0, 2 * np.pi, (80, n)), np.sqrt(rng.random((80, n)))
+    points = list(np.stack([0.3 * radius * np.cos(angle), 1.2 + 0.7 * radius * np.sin(angle)], axis=2))
+    sections = many_sections(points)
+    peeled = peel_sections(sections.points, sections.start, share=0)
+    reach = foliage_reach(sections, peeled.area, peeled.perimeter, peeled.vertices)
+    assert len(np.unique(reach)) == 1
+    hulls, true = peeled.area.mean(), np.pi * 0.3 * 0.7
+    grown = hulls + reach[0] * peeled.perimeter.mean()
+    assert abs(grown / true - 1) < 0.4 * (1 - hulls / true) + 0.005
+
+
+def test_feet_stand_where_foliage_begins():
+    """Few points a section, fewer still at the foot: the sections around tell."""
+    rng = np.random.default_rng(0)
+    points = []
+    for _ in range(80):
+        z = 0.55 + 1.4 * rng.random(40) ** 0.7  # the lower, the deeper in the shade
+        points.append(np.column_stack([rng.uniform(-0.3, 0.3, 40), z]))
+    canopy, feet = find_feet(many_sections(points))
+    assert np.abs(feet[:, 0, 1] - 0.55).max() < 0.1
+    assert np.abs(np.diff(feet[:, 0, 1])).max() < 0.02  # neighbours share what they see
+    # Four fifths of the points near the foot lie between its sides.
+    assert np.abs(feet[:, 1:, 0] - [0.18, -0.18]).max() < 0.07
+    assert len(canopy.points) > 0.97 * 80 * 40
+
+
+def test_indices_and_their_score():
+    good, under, over = modelling_indices(np.array([0.9, 1.0]), np.array([1.1, 1.0]), np.array([1.0, 1.0]))
+    assert good == pytest.approx([0.9, 1])
+    assert under == pytest.approx([0.1, 0])
+    assert over == pytest.approx([0.2, 0])
+    # 120 points a section, of which 50 lie in the one before, too: 7 vertices and 14 faces stand for the other 70.
+    member = [np.arange(k * 70, k * 70 + 120) for k in range(5)]
+    sections = many_sections([np.zeros((120, 2))] * 5, member=member)
+    assert complexity_reduction(sections, c=7)[1:] == pytest.approx(0.1 * (1 - 49 / 70))
+    assert complexity_reduction(sections, c=7)[0] == pytest.approx(0.1 * (1 - 49 / 120))
+
+
+def test_volumes_of_rows_and_of_hectares():
+    rng = np.random.default_rng(0)
+    points = [np.column_stack([rng.uniform(-0.25, 0.25, 4000), rng.uniform(0.5, 2.0, 4000)]) for _ in range(41)]
+    sections = many_sections(points, spacing=2.0)
+    ones = np.ones(41)
+    table = measure_sections(
+        sections, 0.5 * ones, np.zeros((41, 7, 2)), 0.75 * ones, (ones, 0 * ones, 0 * ones), crs=UTM
+    )
+    assert table["height_m"].mean() == pytest.approx(1.98, abs=0.01)
+    assert table["width_m"].mean() == pytest.approx(0.48, abs=0.01)
+    assert np.allclose(table["trv_m3_ha"], table["height_m"] * table["width_m"] * 10_000 / 2.0)
+    assert np.allclose(table["lwa_m2_ha"], 2 * (table["height_m"] - 0.5) * 10_000 / 2.0)
+    rows = summarise_rows(rows_frame([np.array([[0, 0], [10.0, 0]])]), table, step=0.25)
+    assert rows["volume_m3"].tolist() == pytest.approx([0.75 * 10])
+    assert rows["bottom_m"].tolist() == [0.5]
+    # Where sections lack, the foliage ends half a step past the last one.
+    left = summarise_rows(rows, table.drop(index=range(10, 20)).reset_index(drop=True), step=0.25)
+    assert left["volume_m3"].tolist() == pytest.approx([0.75 * (10 - 11 * 0.25 + 0.25)])
+
+
+points_of = st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-0.3, 3)), max_size=25)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.one_of(points_of, st.just([(0.1, 1.5)] * 12), st.just([(0.0, 0.1 * k) for k in range(25)])), max_size=6)
+)
+def test_any_sections_give_a_defined_model(sections):
+    """Sections without points, with three, on a line, of one point many times, of one side only."""
+    points = [np.array(p, dtype=float).reshape(-1, 2) for p in sections]
+    model = model_sections(many_sections(points), Settings(), UTM)
+    assert len(model.polygons) == len(model.table) == len(model.canopy.row_id)
+    assert np.isfinite(model.polygons).all()
+    assert np.isfinite(model.table.drop(columns="geometry").to_numpy()).all()
+
+
+def test_a_million_points_in_a_section():
+    rng = np.random.default_rng(0)
+    crowd = np.column_stack([rng.normal(0, 0.15, 1_000_000), rng.uniform(0.5, 2, 1_000_000)])
+    model = model_sections(many_sections([crowd, crowd[:200]]), Settings(), UTM)
+    assert model.table["n_points"].max() > 900_000
+    assert model.table["height_m"].iloc[0] == pytest.approx(1.98, abs=0.01)
+
+
+def test_a_row_shorter_than_a_step():
+    xyz = np.column_stack([np.random.default_rng(0).uniform([0, -0.2, 0.5], [0.1, 0.2, 2], (500, 3))])
+    rows = rows_frame([np.array([[0, 0], [0.1, 0]])])
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5))
+    model = model_sections(sections, Settings(), UTM)
+    assert len(model.table) == 2
+    assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1

@@ -3,15 +3,26 @@
 import json
 
 import geopandas as gpd
+import laspy
 import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+import shapely
+from pyproj import CRS
+from scipy.spatial import cKDTree
 
 from vinemap import paths
+from vinemap.canopy import section_meshes
+from vinemap.cloud import PointCloud, read_cloud
+from vinemap.config import Settings
 from vinemap.crs import Origin
 from vinemap.evaluate import evaluate_rows
-from vinemap.parcel import map_parcel
+from vinemap.ground import height_above_ground, terrain_model
+from vinemap.mesh import volume
+from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
+from vinemap.section_table import modelling_indices, summarise_rows
+from vinemap.vector import read_boundary
 
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 
@@ -31,6 +42,91 @@ def product(shared, tmp_path_factory):
         return done[name]
 
     return product
+
+
+def true_outlines(profiles, canopy):
+    """True foliage (m polygons) at sections, leaves' reach included, and its height and half width there."""
+    names = sorted({key.split("_")[0] for key in profiles if key.startswith("row")})
+    xy = np.concatenate([np.column_stack([profiles[f"{n}_x"], profiles[f"{n}_y"]]) for n in names])
+    height, half = (np.concatenate([profiles[f"{n}_{key}"] for n in names]) for key in ("height", "half_width"))
+    distance, at = cKDTree(xy).query(canopy.origin[:, :2])
+    away, way = xy[at] - canopy.origin[:, :2], canopy.tangent
+    off = way[:, 0] * away[:, 1] - way[:, 1] * away[:, 0]
+    up = np.linspace(0, 1, 41)
+    shape = np.interp(up, profiles["shape_height"], profiles["shape_half_width"])
+    bottom, reach = float(profiles["foliage_bottom"]), float(profiles["leaf_reach"])
+    z = bottom + up * (height[at] - bottom)[:, None]
+    right, left = (np.stack([off[:, None] + s * shape * half[at][:, None], z], axis=2) for s in (1, -1))
+    rings = np.concatenate([right, left[:, ::-1]], axis=1)
+    return shapely.buffer(shapely.polygons(rings), reach), (half[at] > 0.02) & (distance < 0.3)
+
+
+@pytest.fixture(scope="module")
+def modelled(shared):
+    """Canopies of a shared survey, of a share of its points."""
+
+    def modelled(name, share=1.0):
+        source = shared / "surveys" / name
+        points = read_cloud(source / f"{name}.laz", boundary=read_boundary(source / "boundary.gpkg"))
+        chosen = np.random.default_rng(0).random(len(points.xyz)) < share
+        points = PointCloud(points.xyz[chosen], points.crs)
+        found = map_rows(points, Settings())
+        return found, model_canopies(points, found, Settings())
+
+    return modelled
+
+
+@pytest.mark.parametrize("name", ["parcelF", "twoblocks", "riseholme"])
+def test_canopies_against_the_true_profile(modelled, shared, name):
+    found, model = modelled(name)
+    with np.load(shared / "surveys" / name / "profiles.npz") as profiles:
+        true, living = true_outlines(profiles, model.canopy)
+    shared_area = shapely.area(shapely.intersection(shapely.make_valid(shapely.polygons(model.polygons)), true))
+    good, under, over = modelling_indices(
+        shared_area[living], shapely.area(shapely.polygons(model.polygons))[living], shapely.area(true)[living]
+    )
+    assert good.mean() >= 0.93
+    assert under.mean() <= 0.07
+    assert over.mean() <= 0.18
+    assert (good - under - over).mean() >= 0.70
+    assert model.table["over"].mean() <= 0.09
+    rows = summarise_rows(found.rows, model.table, step=0.25)
+    assert rows["volume_m3"].sum() == pytest.approx(shapely.area(true)[living].sum() * 0.25, rel=0.06)
+    truth = gpd.read_file(shared / "surveys" / name / "truth.gpkg", layer="rows")
+    pairs = evaluate_rows(rows[["geometry"]], truth[["geometry"]]).pairs[["row_id", "reference"]].astype(int)
+    for mine, theirs in (("height_m", "mean_height"), ("width_m", "mean_width")):
+        off = rows[mine].to_numpy()[pairs["row_id"] - 1] - truth[theirs].to_numpy()[pairs["reference"] - 1]
+        assert np.abs(off).max() <= 0.05
+
+
+def test_canopies_of_a_thinner_cloud(modelled):
+    """A third of the points tells the same volume, height and width."""
+    full, thin = (
+        summarise_rows(f.rows, m.table, step=0.25) for f, m in (modelled("parcelF"), modelled("parcelF", 0.35))
+    )
+    assert np.abs(thin["volume_m3"] / full["volume_m3"] - 1).max() < 0.08
+    assert np.abs(thin["height_m"] - full["height_m"]).max() < 0.05
+    assert np.abs(thin["width_m"] - full["width_m"]).max() < 0.08
+
+
+def test_the_real_row(shared):
+    """One row scanned by a tractor's lidar: its package's examples have a canopy 0.426 m wide."""
+    xyz = np.asarray(laspy.read(shared / "real" / "vine_row_1p9m.las").xyz)
+    points = PointCloud(xyz, CRS.from_epsg(25831))
+    dtm = terrain_model(points)
+    middle = np.median(xyz[xyz[:, 2] > 0.5, 1])
+    line = shapely.LineString([(0, middle, 0), (1.9, middle, 0)])
+    rows = gpd.GeoDataFrame({"row_id": [1], "label": ["1"], "spacing_m": [2.5]}, geometry=[line], crs=points.crs)
+    none = gpd.GeoDataFrame({key: np.empty(0) for key in ("row_id", "start_m", "end_m")}, geometry=[], crs=points.crs)
+    found = RowMap(dtm, height_above_ground(points, dtm), None, None, 0, rows, none)
+    model = model_canopies(points, found, Settings())
+    rows = summarise_rows(rows, model.table, step=0.25)
+    assert len(model.table) == 9
+    assert rows["height_m"].iloc[0] == pytest.approx(1.5, abs=0.15)
+    assert rows["width_m"].iloc[0] == pytest.approx(0.43, abs=0.06)
+    assert rows["bottom_m"].iloc[0] == pytest.approx(0.5, abs=0.1)
+    (mesh,) = section_meshes(model.canopy, model.polygons, rows, step=0.25)
+    assert volume(mesh) == pytest.approx(rows["volume_m3"].iloc[0], rel=0.1)
 
 
 def rows_of(folder, name):

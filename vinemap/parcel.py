@@ -244,11 +244,12 @@ def model_canopies(
     """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
     options = settings.sections.model_dump()
     sections = step("Sections", cut_sections, points, found.heights, found.rows, found.gaps, found.dtm, **options)
-    model: CanopyModel = step("Canopy", _model_canopy, sections, settings, points.crs)
+    model: CanopyModel = step("Canopy", model_sections, sections, settings, points.crs)
     return model
 
 
-def _model_canopy(sections: Sections, settings: Settings, crs: CRS) -> CanopyModel:
+def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyModel:
+    """Model the canopies of sections, those that have one, by polygons (section 3.2)."""
     leaves, soil = separate_canopy(sections, **settings.canopy.model_dump())
     canopy, feet = find_feet(leaves)
     peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
