@@ -1,5 +1,6 @@
 """Commands as a person types them: results, and one line for everything that can be wrong."""
 
+import json
 import os
 import subprocess
 import sys
@@ -48,6 +49,25 @@ def test_run_and_evaluate(tmp_path, survey):
     assert len(gpd.read_file(tmp_path / "pairs.gpkg", layer="pairs")) == 6
     assert done.returncode == 0
     assert "good 100.0%, extra 0.0%, missed 0.0%" in done.stdout
+
+
+def test_classified_clouds_and_plain_meshes_on_demand(tmp_path, survey):
+    done = vinemap("run", survey, "--out", "usual", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert not list((tmp_path / "usual").glob("*.laz"))
+    done = vinemap("run", survey, "--out", "asked", "--classified", "--plain", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    las = laspy.read(tmp_path / "asked" / "small_classified.laz")
+    assert len(las.points) == len(laspy.read(survey).points)
+    assert {1, 2, 5} <= set(np.asarray(las.classification)) <= {1, 2, 5, 7}
+    light, plain = ((tmp_path / name / "small_canopy.glb").read_bytes() for name in ("usual", "asked"))
+    assert b"KHR_mesh_quantization" in light
+    assert b"KHR_mesh_quantization" not in plain
+    assert len(light) < 0.7 * len(plain)
+    record = json.loads((tmp_path / "asked" / "run.json").read_text())
+    assert record["settings"]["product"] == {"classified": True, "plain": True}
+    assert "small_classified.laz" in record["files"]
+    assert record["modelling"]["good"] > 0.95
 
 
 def test_settings_and_names_from_the_command_line(tmp_path, survey):

@@ -28,6 +28,7 @@ def along(profile, length=10.0, sections=5, shift=(0.0, 0.0, 0.0)):
 
 SQUARE = [[0, 0], [1, 0], [1, 2], [-1, 2], [-1, 0]]
 NOTCHED = [[0, 1.5], [1, 0], [1, 2], [0.5, 2.5], [-1, 2], [-1, 0]]
+FLAT = [[0, 0], [0.5, 0], [1, 1], [0.5, 2], [-0.5, 2], [-1, 1], [-0.5, 0]]
 LEANING = [[0, 0], [0.1, 1], [1, 1.2], [1, 2], [-1, 2], [-1, 1.2], [-0.1, 1]]
 
 
@@ -45,7 +46,7 @@ def closed(vertices, faces):
 
 @pytest.mark.parametrize("profile", [SQUARE, NOTCHED, LEANING, NOTCHED[::-1]])
 def test_a_prism_is_closed_points_outward_and_has_its_volume(profile):
-    vertices, faces = loft(along(profile))
+    vertices, faces, _ = loft(along(profile))
     c = len(profile)
     assert vertices.shape == (5 * c, 3)
     assert len(faces) == 2 * c * 4 + 2 * (c - 2)
@@ -63,7 +64,7 @@ def test_a_prism_is_closed_points_outward_and_has_its_volume(profile):
 
 
 def test_sides_are_equation_22():
-    _, faces = loft(along([[0, 0], [1, 0], [0, 1]], sections=3)[:, ::-1])
+    _, faces, _ = loft(along([[0, 0], [1, 0], [0, 1]], sections=3)[:, ::-1])
     assert faces[:6].tolist() == [[0, 1, 3], [1, 2, 4], [2, 0, 5], [1, 4, 3], [2, 5, 4], [0, 3, 5]]
     assert (faces[6:12] == faces[:6] + 3).all()
 
@@ -74,13 +75,13 @@ def test_repeated_and_flat_vertices_still_close():
         [[0, 0], [1, 0], [1, 0], [1, 2], [1, 2], [-1, 2], [-1, 0]],
         [[i, i] for i in range(7)],
     ):
-        vertices, faces = loft(along(profile))
+        vertices, faces, _ = loft(along(profile))
         assert closed(vertices, faces)
         assert volume(Mesh(vertices, faces)) == pytest.approx(10 * area(profile), abs=1e-6)
 
 
 def test_a_crossed_polygon_still_closes():
-    assert closed(*loft(along([[0, 0], [1, 1], [1, 0], [0, 1], [0.3, 2]])))
+    assert closed(*loft(along([[0, 0], [1, 1], [1, 0], [0, 1], [0.3, 2]]))[:2])
 
 
 @pytest.mark.parametrize("shape", [(1, 7, 3), (2, 2, 3), (5, 7, 2), (7, 3)])
@@ -90,13 +91,15 @@ def test_too_few_sections_or_vertices_are_refused(shape):
 
 
 def test_pieces_of_a_row_merge():
-    pieces = [loft(along(SQUARE)), loft(along(NOTCHED, length=4, shift=(20, 0, 0)))]
+    pieces = [loft(along(SQUARE)), loft(along(NOTCHED[::-1], length=4, sections=3, shift=(20, 0, 0)))]
     row = Mesh(*merge(pieces))
+    assert row.pieces == ((5, 5, True), (3, 6, False))
     assert closed(row.vertices, row.faces)
     assert volume(row) == pytest.approx(10 * area(SQUARE) + 4 * area(NOTCHED))
     assert trimesh.Trimesh(row.vertices, row.faces).body_count == 2
     empty = Mesh(*merge([]))
     assert (empty.vertices.shape, empty.faces.shape, volume(empty)) == ((0, 3), (0, 3), 0)
+    assert empty.pieces == ()
 
 
 # glTF
@@ -136,18 +139,16 @@ class Row(NamedTuple):
     """A row's node as the file holds it."""
 
     node: dict
-    mode: int
+    modes: list
+    """Of each primitive."""
+    orders: list
+    """Of each primitive: indices as they are stored."""
     stored: np.ndarray
-    """(n, 3) positions, as numbers of the file."""
+    """(n, 3) positions of all primitives, as numbers of the file."""
     vertices: np.ndarray
-    """(n, 3) positions about the origin, z up, m."""
+    """(n, 3) the same about the origin, z up, m."""
     faces: np.ndarray
-    """(m, 3) triangles that have three vertices."""
-
-
-def proper(faces):
-    """Whether triangles have three vertices."""
-    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    """(m, 3) triangles of all primitives."""
 
 
 def decode(path):
@@ -175,35 +176,39 @@ def decode(path):
     for node in document["nodes"]:
         if "mesh" not in node:
             continue
-        (primitive,) = document["meshes"][node["mesh"]]["primitives"]
-        stored, order = array(primitive["attributes"]["POSITION"]), array(primitive["indices"]).ravel().astype(int)
-        if primitive["mode"] == 5:
-            faces = np.lib.stride_tricks.sliding_window_view(order, 3).copy()
-            faces[1::2] = faces[1::2, ::-1]
-        else:
-            faces = order.reshape(-1, 3)
+        primitives = document["meshes"][node["mesh"]]["primitives"]
+        modes = [primitive["mode"] for primitive in primitives]
+        points = [array(primitive["attributes"]["POSITION"]) for primitive in primitives]
+        orders = [array(primitive["indices"]).ravel().astype(int) for primitive in primitives]
+        first = np.cumsum([0] + [len(p) for p in points])
+        faces = [triangles(mode, order) + i for mode, order, i in zip(modes, orders, first[:-1], strict=True)]
+        stored = np.concatenate(points)
         vertices = stored * np.array(node.get("scale", [1, 1, 1])) + node["translation"]
-        rows.append(Row(node, primitive["mode"], stored, vertices, faces[proper(faces)]))
+        rows.append(Row(node, modes, orders, stored, vertices, np.concatenate(faces)))
     return rows
 
 
-def oriented(faces):
-    """Triangles as sorted tuples, each begun at its lowest vertex."""
-    return sorted(tuple(np.roll(face, -np.argmin(face)).tolist()) for face in faces)
+def triangles(mode, order):
+    """Triangles (m, 3) of a primitive's indices."""
+    if mode == 4:
+        return order.reshape(-1, 3)
+    faces = np.lib.stride_tricks.sliding_window_view(order, 3).copy()
+    faces[1::2] = faces[1::2, ::-1]
+    return faces
 
 
 def loaded(path):
-    """Name and shape of each row as trimesh places and merges it, without triangles of repeated vertices."""
+    """The shapes of each row, by its node's name, as trimesh places them; all of them watertight at once."""
     scene = trimesh.load(path)
-    for label in scene.graph.nodes_geometry:
-        transform, name = scene.graph[label]
-        shape = scene.geometry[name].copy()
-        shape.apply_transform(transform)
-        shape.update_faces(proper(shape.faces))
-        assert shape.is_watertight
-        shape.merge_vertices()
-        shape.update_faces(proper(shape.faces))
-        yield label, shape
+    assert all(shape.is_watertight and shape.is_winding_consistent for shape in scene.geometry.values())
+    assert all(shape.volume > 0 for shape in scene.dump())
+    shapes = {}
+    for node in scene.graph.nodes_geometry:
+        parent = scene.graph.transforms.parents[node]
+        transform, name = scene.graph[node]
+        shape = scene.geometry[name].copy().apply_transform(transform)
+        shapes.setdefault(node if parent == "canopy" else parent, []).append(shape)
+    return shapes
 
 
 def test_glb_has_a_node_a_row_with_its_numbers(tmp_path):
@@ -228,28 +233,22 @@ def test_glb_reads_back_in_metres_y_up(tmp_path, plain):
         bumpy(100, turn=1, row_id=4, label="4 F"),
         bumpy(100, turn=-1, row_id=5, label="5 F"),
         Mesh(*loft(along(doubled, sections=30)), row_id=6, label="6 F"),
+        Mesh(
+            *merge(loft(along(NOTCHED, length=k / 4, sections=k, shift=(k, 0, 0))) for k in range(2, 30, 9)), 7, "7 F"
+        ),
     ]
     write_glb(meshes, path, origin=ORIGIN, crs="EPSG:32632", plain=plain)
-    shapes = dict(loaded(path))
-    assert set(shapes) == {"1 F", "2 F", "4 F", "5 F", "6 F"}
+    shapes = loaded(path)
+    assert set(shapes) == {"1 F", "2 F", "4 F", "5 F", "6 F", "7 F"}
     for row in meshes:
         if row.label not in shapes:
             continue
-        shape = shapes[row.label]
-        assert shape.is_watertight
-        assert shape.is_winding_consistent
+        assert len(shapes[row.label]) == (1 if plain else len(row.pieces))
+        shape = trimesh.util.concatenate(shapes[row.label])
         assert shape.volume == pytest.approx(volume(row), rel=1e-5 if plain else 0.01)
         expected = trimesh.transform_points(row.vertices - ORIGIN, TURN)
         tolerance = 1e-5 if plain else 0.001
         np.testing.assert_allclose(shape.bounds, [expected.min(axis=0), expected.max(axis=0)], atol=tolerance)
-
-
-def test_trimesh_drops_the_strips_triangles_without_area_itself(tmp_path):
-    path = tmp_path / "F_canopy.glb"
-    write_glb([bumpy(100)], path, origin=ORIGIN, crs="EPSG:32632")
-    (shape,) = trimesh.load(path, validate=True).geometry.values()
-    assert shape.is_watertight
-    assert len(shape.faces) == len(bumpy(100).faces)
 
 
 def test_positions_are_whole_steps_that_the_node_scales(tmp_path):
@@ -268,51 +267,84 @@ def test_positions_are_whole_steps_that_the_node_scales(tmp_path):
 
 
 def test_vertices_in_one_place_are_written(tmp_path):
-    mesh = Mesh(np.broadcast_to(ORIGIN, (10, 3)), loft(along(SQUARE, sections=2))[1])
+    mesh = Mesh(np.broadcast_to(ORIGIN, (10, 3)), *loft(along(SQUARE, sections=2))[1:])
     write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
     assert not decode(tmp_path / "a.glb")[0].vertices.any()
 
 
 @pytest.mark.parametrize("turn", [1, -1])
-@pytest.mark.parametrize("profile", [SQUARE, NOTCHED, LEANING])
-@pytest.mark.parametrize("lengths", [(9,), (2, 40), (40, 2, 2, 30), (12, 11, 10)])
-def test_a_strip_draws_the_faces(tmp_path, lengths, profile, turn):
-    pieces = [loft(along(profile[::turn], sections=k, shift=(20 * i, 0, 0))) for i, k in enumerate(lengths)]
-    mesh = Mesh(*merge(pieces))
-    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+@pytest.mark.parametrize("k", [2, 3, 4, 11])
+@pytest.mark.parametrize("c", [3, 4, 5, 6, 7, 8, 12])
+def test_a_piece_is_one_strip_that_closes_it(tmp_path, c, k, turn):
+    angle = 2 * np.pi * np.arange(c)[::turn] / c
+    profile = np.column_stack([np.sin(angle), np.cos(angle)])
+    write_glb([Mesh(*loft(along(profile, sections=k)))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
     (row,) = decode(tmp_path / "a.glb")
-    assert row.mode == 5
-    assert oriented(row.faces) == oriented(mesh.faces)
+    (order,) = row.orders
+    assert (row.modes, len(order), set(order.tolist())) == ([5], 2 * k * c - 2, set(range(k * c)))
+    assert (row.faces != np.roll(row.faces, 1, axis=1)).all()
+    assert closed(row.vertices, row.faces)
+    assert volume(Mesh(row.vertices, row.faces)) == pytest.approx(10 * area(profile), rel=1e-3)
+    # The sides' triangles are halves of Eq. 22's quadrilaterals, the others lie in the caps.
+    section, corner = np.divmod(row.faces, c)
+    side = np.ptp(section, axis=1) > 0
+    assert (side.sum(), np.ptp(section, axis=1).max()) == (2 * c * (k - 1), 1)
+    steps = (corner[side] - np.roll(corner[side], 1, axis=1)) % c
+    assert (np.isin(steps, [0, 1, c - 1]) & (np.sort(steps, axis=1)[:, :1] == 0)).all()
+    assert set(section[~side].ravel().tolist()) == {0, k - 1}
 
 
-def test_a_strip_takes_pieces_of_any_profile_and_turn(tmp_path):
-    pieces = [loft(along(p, sections=20)) for p in (SQUARE, LEANING[::-1], NOTCHED[::-1], [[0, 0], [1, 0], [0, 1]])]
-    mesh = Mesh(*merge(pieces))
-    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+def test_a_strip_zigzags_over_the_caps_and_winds_up_the_sides(tmp_path):
+    write_glb([Mesh(*loft(along(LEANING, sections=2)))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
     (row,) = decode(tmp_path / "a.glb")
-    assert row.mode == 5
-    assert oriented(row.faces) == oriented(mesh.faces)
+    sides = [6, 13, 0, 7, 1, 8, 2, 9, 3, 10, 4, 11, 5, 12]
+    assert row.orders[0].tolist() == [2, 3, 1, 4, 0, 5, *sides, 13, 11, 7, 10, 8, 9]
 
 
-def test_faces_of_any_order_are_written(tmp_path):
+@pytest.mark.parametrize("turn", [1, -1])
+@pytest.mark.parametrize("profile", [SQUARE, NOTCHED, FLAT])
+def test_a_strips_caps_cover_the_polygons_once(tmp_path, profile, turn):
+    profile = [profile[0], *profile[1:][::turn]]
+    write_glb([Mesh(*loft(along(profile, sections=9)))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    (row,) = decode(tmp_path / "a.glb")
+    shape = trimesh.Trimesh(row.vertices, row.faces, process=False)
+    assert (shape.area_faces > 0.01).all()
+    for end, side in ((0, -1), (10, 1)):
+        on = np.isclose(shape.triangles[:, :, 0], end).all(axis=1)
+        assert on.sum() == len(profile) - 2
+        assert shape.area_faces[on].sum() == pytest.approx(area(profile), rel=1e-3)
+        assert (shape.face_normals[on][:, 0] * side > 0.99).all()
+
+
+def test_trimesh_finds_no_triangle_to_drop(tmp_path):
+    for profile in (FLAT, [FLAT[0], *FLAT[1:][::-1]]):
+        write_glb([Mesh(*loft(along(profile)))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+        (shape,) = trimesh.load(tmp_path / "a.glb", validate=True).geometry.values()
+        assert shape.is_watertight
+        assert len(shape.faces) == 2 * 7 * 5 - 4
+
+
+def test_a_row_has_a_primitive_a_piece_of_any_profile_and_turn(tmp_path):
+    profiles = (SQUARE, LEANING[::-1], NOTCHED[::-1], LEANING, [[0, 0], [1, 0], [0, 1]])
+    pieces = [loft(along(p, sections=20 + i, shift=(20 * i, i, 0))) for i, p in enumerate(profiles)]
+    write_glb([Mesh(*merge(pieces))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    (row,) = decode(tmp_path / "a.glb")
+    assert row.modes == [5] * 5
+    shapes = trimesh.load(tmp_path / "a.glb").dump()
+    volumes = sorted(shape.volume for shape in shapes)
+    assert volumes == pytest.approx(sorted(volume(Mesh(*piece)) for piece in pieces), rel=0.01)
+    assert closed(row.vertices, row.faces)
+
+
+def test_faces_that_no_loft_made_are_a_list(tmp_path):
     whole = bumpy(100)
     sphere = trimesh.creation.icosphere()
-    orders = {
-        5: [np.concatenate([whole.faces, sphere.faces[:40] + 99]), np.delete(whole.faces, -3, axis=0)],
-        4: [
-            whole.faces[1:],
-            np.random.default_rng(0).permutation(whole.faces),
-            sphere.faces,
-            whole.faces[:3],
-            np.full((1, 3), 5),
-        ],
-    }
-    for mode, meshes in orders.items():
-        for faces in meshes:
-            write_glb([Mesh(whole.vertices, faces)], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
-            (row,) = decode(tmp_path / "a.glb")
-            assert row.mode == mode
-            assert oriented(row.faces) == oriented(faces[proper(faces)])
+    orders = [whole.faces, np.random.default_rng(0).permutation(whole.faces), sphere.faces, np.full((1, 3), 5)]
+    for faces in orders:
+        write_glb([Mesh(whole.vertices, faces)], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+        (row,) = decode(tmp_path / "a.glb")
+        assert (row.modes, row.stored.dtype) == ([4], np.int16)
+        assert (row.faces == faces).all()
 
 
 def test_a_section_takes_half_the_bytes_of_plain_lists(tmp_path):
@@ -326,6 +358,24 @@ def test_a_section_takes_half_the_bytes_of_plain_lists(tmp_path):
     assert size[480, False] < 88 * 480
 
 
+def test_rows_of_several_pieces_stay_light(tmp_path):
+    numbers = {f"number_{i:02d}_m": round(100 * np.sin(i), 3) for i in range(30)}
+    meshes, sections = [], 0
+    for i in range(16):
+        lengths = [30 + 5 * i, 31 + 5 * i, 32 + 5 * i, 33 + 5 * i, 334 - 20 * i]
+        starts = np.cumsum([0, *lengths]) / 4
+        pieces = [
+            loft(along(LEANING, length=k / 4, sections=k, shift=(x, 2.5 * i, 0)))
+            for k, x in zip(lengths, starts[:-1], strict=True)
+        ]
+        meshes.append(Mesh(*merge(pieces), row_id=i, label=f"{i} F", extras=numbers))
+        sections += sum(lengths)
+    assert sections == 16 * 460
+    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    assert (tmp_path / "a.glb").stat().st_size <= 92 * sections
+    assert sum(len(row.modes) for row in decode(tmp_path / "a.glb")) == 80
+
+
 def test_plain_is_float32_and_lists_without_extensions(tmp_path):
     meshes = [*rows()[:2], bumpy(100)]
     write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632", plain=True)
@@ -333,24 +383,36 @@ def test_plain_is_float32_and_lists_without_extensions(tmp_path):
     assert not any(key.startswith("extensions") for key in document)
     assert document["bufferViews"][0]["byteStride"] == 12
     for row, mesh in zip(decode(tmp_path / "a.glb"), meshes, strict=True):
-        assert (row.mode, row.stored.dtype, "scale" in row.node) == (4, np.float32, False)
+        assert (row.modes, row.stored.dtype, "scale" in row.node) == ([4], np.float32, False)
         assert (row.faces == mesh.faces).all()
         np.testing.assert_allclose(row.vertices, mesh.vertices - ORIGIN, atol=4e-6)
 
 
-def test_rows_of_the_same_faces_share_them(tmp_path):
+@pytest.mark.parametrize("plain", [False, True])
+def test_rows_of_the_same_faces_share_them(tmp_path, plain):
     meshes = [Mesh(*loft(along(SQUARE, shift=(0, 2.5 * i, 0))), row_id=i, label=f"{i} F") for i in range(3)]
-    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    write_glb(meshes, tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632", plain=plain)
     document = read(tmp_path / "a.glb")
     assert len({mesh["primitives"][0]["indices"] for mesh in document["meshes"]}) == 1
 
 
-def test_more_than_65535_vertices_take_wide_indices(tmp_path):
-    mesh = Mesh(*loft(along(LEANING, length=3000, sections=9400)), row_id=1, label="1 F")
-    write_glb([mesh], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+def test_pieces_share_indices_if_they_turn_alike_and_are_as_long(tmp_path):
+    kinds = [(LEANING, 9), (LEANING[::-1], 9), (LEANING, 9), (LEANING, 8), (LEANING[::-1], 9)]
+    pieces = [loft(along(p, sections=k, shift=(20 * i, 0, 0))) for i, (p, k) in enumerate(kinds)]
+    write_glb([Mesh(*merge(pieces))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
+    a, b, c, d, e = (p["indices"] for p in read(tmp_path / "a.glb")["meshes"][0]["primitives"])
+    assert (a, b) == (c, e)
+    assert len({a, b, d}) == 3
+
+
+def test_pieces_of_more_than_65535_vertices_take_wide_indices(tmp_path):
+    long, short = (loft(along(LEANING, length=k / 4, sections=k, shift=(-k, 0, 0))) for k in (9400, 4000))
+    write_glb([Mesh(*merge([long, short, short]))], tmp_path / "a.glb", origin=ORIGIN, crs="EPSG:32632")
     document = read(tmp_path / "a.glb")
-    assert document["accessors"][document["meshes"][0]["primitives"][0]["indices"]]["componentType"] == 5125
-    assert oriented(decode(tmp_path / "a.glb")[0].faces) == oriented(mesh.faces)
+    primitives = document["meshes"][0]["primitives"]
+    assert [document["accessors"][p["indices"]]["componentType"] for p in primitives] == [5125, 5123, 5123]
+    (row,) = decode(tmp_path / "a.glb")
+    assert closed(row.vertices, row.faces)
 
 
 def test_no_rows_give_a_root_alone(tmp_path):

@@ -44,7 +44,7 @@ def test_every_section_holds_the_points_around_its_station():
     line = np.column_stack([30 * np.sin(t), 30 - 30 * np.cos(t)])
     xyz = np.column_stack([rng.uniform(-3, 30, 40000), rng.uniform(-3, 20, 40000), rng.uniform(0, 2, 40000)])
     rows = rows_frame([line])
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5), width=0.4, step=0.25)
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5), min_points=0)
     length = rows.length.iloc[0]
     assert len(sections.row_id) == round(length / 0.25) + 1
     assert sections.position[[0, -1]] == pytest.approx([0, length])
@@ -76,6 +76,17 @@ def test_points_go_to_the_nearest_row():
     y = sections.points[:, 0] + sections.origin[sections.section, 1]
     assert (y[sections.row_id[sections.section] == 1] <= 1.13).all()
     assert (y[sections.row_id[sections.section] == 2] >= 0.87).all()
+
+
+@pytest.mark.parametrize(("per_metre", "width"), [(200, 0.4), (75, 0.6), (5, 1.0)])
+def test_sections_are_wider_where_points_are_few(per_metre, width):
+    n = 20 * per_metre
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(0, 20, n), rng.uniform(-0.5, 0.5, n), rng.uniform(1, 2, n)])
+    rows = rows_frame([np.array([[0, 0], [20.0, 0]])])
+    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5))
+    inner = (sections.position > 1) & (sections.position < 19)
+    assert np.diff(sections.start)[inner].mean() == pytest.approx(per_metre * width, rel=0.15)
 
 
 def test_no_rows_no_sections():

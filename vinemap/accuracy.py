@@ -165,10 +165,11 @@ EASED = {
     ("thin", "DEP m", "mean"): 0.10,
     ("terraces", "DTM m", "median"): 0.03,
     ("terraces", "DTM m", "95%"): 0.20,
-    ("thin", TRUE_FOLIAGE, "G"): 0.85,
-    ("thin", TRUE_FOLIAGE, "U"): 0.15,
-    ("thin", TRUE_FOLIAGE, "G − U − O"): 0.55,
+    ("sparse", "width m", "worst row"): 0.10,
 }
+EASED |= {(family, TRUE_FOLIAGE, "G"): 0.85 for family in ("thin", "sparse")}
+EASED |= {(family, TRUE_FOLIAGE, "U"): 0.15 for family in ("thin", "sparse")}
+EASED |= {(family, TRUE_FOLIAGE, "G − U − O"): 0.55 for family in ("thin", "sparse")}
 """Bars that are lower for a family."""
 
 

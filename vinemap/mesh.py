@@ -175,9 +175,9 @@ def write_glb(
     label, is moved to the row's middle. Faces are shaded flat (no normals).
 
     Positions are 16-bit steps of 1/65534 of the row's longest side, 1.8 mm in 120 m, that the node scales to metres
-    (KHR_mesh_quantization). Each lofted piece is a primitive, a triangle strip that closes it without triangles of
-    repeated vertices; it splits the quadrilaterals along one diagonal or the other, and joins each section's last
-    corner to the next one's first. Other meshes are lists of triangles.
+    (KHR_mesh_quantization). Each lofted piece is a primitive: one triangle strip that closes it, caps included, without
+    triangles of repeated vertices. Its quadrilaterals are those of Eq. 22, some split along the other diagonal. Other
+    meshes are lists of triangles.
 
     Parameters
     ----------
@@ -282,9 +282,8 @@ def write_glb(
         out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
     # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
     document = out.gltf_to_json(separators=(",", ":"), indent=None).encode()
-    chunks = _chunk(b"JSON", document, b" ") + (
-        _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
-    )
+    binary = _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
+    chunks = _chunk(b"JSON", document, b" ") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
@@ -297,18 +296,15 @@ def _quantise(centred: Vertices) -> tuple[NDArray[np.int16], float]:
 def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
     """One triangle strip (2 * k * c - 2,) that closes a piece of k sections of c corners, outward.
 
-    From vertex n to n + c and back it winds up the sides, where each section's last corner is followed by the next
-    one's first; below the first vertex and above the last it folds back, and zigzags across the caps.
+    Numbered ring by ring, it goes from vertex n to n + c, n + 1 and on up the sides as a helix; below the first vertex
+    and above the last it folds back, and zigzags across the cap. Rings are numbered so that it faces outward, and that
+    the caps' triangles have no tip at corner 0, which may lie on its neighbours' line (unless c < 5).
     """
-    last, over = sections * corners - 1, corners // 2
+    last, over, odd = sections * corners - 1, corners // 2, corners % 2 == 1
     n = np.arange(-over, last - corners + over + 1)
     strip = np.column_stack([abs(n), last - abs(last - corners - n)]).ravel()
-    if corners % 2 == 0:
-        strip = strip[1:-1]  # where it folds there is one vertex, not two
-    if turned != (corners % 2 == 1):
-        corner = strip % corners
-        strip += -corner % corners - corner
-    return strip
+    strip = strip if odd else strip[1:-1]  # where it folds, an even ring has one vertex, not two
+    return strip - strip % corners + (strip - 1 if turned == odd else 1 - strip) % corners
 
 
 def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:

@@ -63,7 +63,6 @@ STAGES = (
     "Canopy",
     "Mesh",
     "Writing",
-    "Classification",
 )
 
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
@@ -199,10 +198,15 @@ def map_parcel(
             "parcel": parcel_layer(parcel, rows, polygon, points),
         }
         chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
-        surfaces, plain = (found.dtm, chm), settings.product.plain
-        run("Writing", write_product, draft, parcel, layers, surfaces, found.field, meshes, points, plain=plain)
-        if settings.product.classified:
-            run("Classification", _write_classified, draft, parcel, points, heights, leaves)
+
+        def write() -> None:
+            plain = settings.product.plain
+            write_product(draft, parcel, layers, (found.dtm, chm), found.field, meshes, points, plain=plain)
+            if settings.product.classified:
+                classes = classify_points(points, heights, leaves)
+                write_classified(points, heights, *classes, paths.classified_cloud(draft, parcel))
+
+        run("Writing", write)
         counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
@@ -265,13 +269,6 @@ def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyMo
     indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
     table = measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
     return CanopyModel(canopy, polygons, table, leaves)
-
-
-def _write_classified(
-    folder: Path, parcel: str, points: PointCloud, heights: NDArray[np.floating], leaves: Sections
-) -> None:
-    classes, row_id = classify_points(points, heights, leaves)
-    write_classified(points, heights, classes, row_id, paths.classified_cloud(folder, parcel))
 
 
 def _corner(dtm: Raster) -> Origin:

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     Values = NDArray[np.floating]
 
 
+CANOPY, HALF = 0.5, 0.9
+"""Metres above ground, and to both sides of a row, within which points are taken for canopy."""
+
+
 def cut_sections(
     cloud: PointCloud,
     heights: Values,
@@ -31,6 +35,8 @@ def cut_sections(
     *,
     width: float = 0.4,
     step: float = 0.25,
+    min_points: int = 45,
+    max_width: float = 1.0,
 ) -> Sections:
     """Cut sections along every row, except where it has no canopy (Eq. 2–3).
 
@@ -48,6 +54,8 @@ def cut_sections(
         Terrain, for the sections' origins.
     width, step : float
         Extent a of a section along γ, and distance b of sections along γ, in metres.
+    min_points, max_width : int, float
+        Points above ``CANOPY`` that sections of a row are widened for, and metres to which they may be.
     """
     if len(rows) == 0:
         none = np.empty(0)
@@ -65,7 +73,10 @@ def cut_sections(
 
     def find(k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         mine = slice(near.start[k], near.start[k + 1])
-        return _members(near.along[mine], parts[k], width / 2)
+        canopy = (heights[near.member[mine]] > CANOPY) & (np.abs(near.left[mine]) < HALF)
+        per_metre = max(float(canopy.sum()), 1.0) / max(len(parts[k]) * step, step)
+        a = max(width, min(max_width, min_points / per_metre))
+        return _members(near.along[mine], parts[k], a / 2)
 
     found = in_threads(find, range(len(lines)))
     start = np.concatenate([[0], np.cumsum(np.concatenate([n for n, _ in found]))])

@@ -40,6 +40,8 @@ REFERENCE = {"width": 0.4, "step": 0.1}
 """Sections against which models are held."""
 OUTLINE = 30
 """Vertices with which a polygon is as good as the foliage's outline."""
+GENERATIONS = 12
+"""Of the differential evolution."""
 LENGTH = 128.0
 """Metres of rows that are enough for a search, as in the thesis."""
 
@@ -74,7 +76,8 @@ def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b
 
 def _model(points: PointCloud, found: RowMap, sections: dict[str, float], c: int, foot: str) -> CanopyModel:
     settings = Settings(
-        sections=SectionOptions.model_validate(sections), polygon=PolygonOptions.model_validate({"c": c, "foot": foot})
+        sections=SectionOptions.model_validate(sections | {"min_points": 0}),
+        polygon=PolygonOptions.model_validate({"c": c, "foot": foot}),
     )
     return model_canopies(points, found, settings)
 
@@ -97,9 +100,14 @@ def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tup
     return out, np.asarray(np.isfinite(out).all(axis=(1, 2)))
 
 
+def reference_model(points: PointCloud, found: RowMap) -> CanopyModel:
+    """The foliage's outlines in fine sections, V_ref of Table 3.1."""
+    return _model(points, found, REFERENCE, OUTLINE, "foliage")
+
+
 def search(points: PointCloud, found: RowMap, *, seed: int = 0, generations: int = 12) -> tuple[float, float, int]:
     """The [a, b, c] of the highest mean Q within the thesis's ranges, by differential evolution."""
-    reference = _model(points, found, REFERENCE, OUTLINE, "foliage")
+    reference = reference_model(points, found)
 
     def loss(x: Values) -> float:
         value = score(points, found, reference, float(x[0]), float(x[1]), round(float(x[2])), "foliage")
@@ -155,8 +163,8 @@ def main(cloud: Path, boundary: Path | None, parcel: str | None, crs: str | None
     found = some_rows(map_rows(points, Settings()), length)
     if len(found.rows) == 0:
         raise InputError(f"{cloud}: no vine row found, so that there is no canopy to model")
-    best = search(points, found)
-    reference = _model(points, found, REFERENCE, OUTLINE, "foliage")
+    best = search(points, found, generations=GENERATIONS)
+    reference = reference_model(points, found)
     models = {"best": (*best, "foliage"), "the thesis's": (*THESIS, "foliage"), "on the soil": (*THESIS, "soil")}
     scores = {}
     for name, (a, b, c, foot) in models.items():
