@@ -377,8 +377,8 @@ def test_foliage_grows_by_its_reach_on_all_sides(seed):
     grown = MultiPoint(outline).convex_hull
     assert start.tolist() == [0, len(outline)]
     assert grown.covers(body)
-    # Sides move by the reach; corners are cut, never by more.
-    assert body.buffer(0.05, quad_segs=64).buffer(1e-4).covers(grown)
+    # Sides move by the reach, blunt corners by a sixth more at the most.
+    assert body.buffer(0.05 / np.cos(np.radians(30)), quad_segs=64).buffer(1e-4).covers(grown)
     assert grown.exterior.distance(body) > 0.02
     assert grown.area == pytest.approx(body.buffer(0.05).area, rel=0.03)
     np.testing.assert_allclose(moved[0] - feet, [[0, -0.05], [0.025, -0.05], [-0.025, -0.05]], atol=1e-12)

@@ -22,6 +22,8 @@ BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""
 NOISE_CELL = 0.1
 """Metres: cells of a section in which a point has neighbours or is noise."""
+TALL = 0.1
+"""Share of a section's canopy that must be high."""
 GROUND = 0.3
 """Metres above or below the terrain model within which points tell the inter-row's elevation."""
 SHORTFALL = 1.15
@@ -67,7 +69,7 @@ def separate_canopy(
     min_share : float
         Share of the median section's points that a section must have.
     min_height : float
-        Metres that 90% height of a section must reach.
+        Metres that the highest tenth of a section must reach.
 
     Returns
     -------
@@ -79,14 +81,12 @@ def separate_canopy(
     m = len(sections.row_id)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, n, tall = np.zeros((m, 2, 2)), np.zeros(m, dtype=np.int64), np.zeros(m)
-    limits = (margin, half_width, max_height, min_neighbours)
+    limits = (margin, half_width, max_height, min_neighbours, min_height)
     in_threads(
         lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, n, tall),
         stretches(m),
     )
-    enough = (n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)) & (
-        tall >= min_height
-    )
+    enough = (n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)) & (tall >= TALL)
     soil = np.concatenate([np.zeros((m, 1, 2)), walls * np.array([[1.0, 1.0], [-1.0, 1.0]])], axis=1)
     return sections.subset(keep & np.repeat(enough, np.diff(sections.start)), enough), soil[enough]
 
@@ -98,50 +98,55 @@ def _separate(
     start: NDArray[np.int64],
     points: Values,
     height: Values,
-    limits: tuple[float, float, float, float],
+    limits: tuple[float, float, float, float, float],
     keep: Flags,
     walls: Values,
     n: NDArray[np.int64],
     tall: Values,
 ) -> None:
-    """Flag the canopy's points of sections; write wall w and level h of both sides, points and 90% height."""
-    margin, half_width, max_height, share = limits
+    """Flag the canopy's points of sections; write wall w and level h of both sides, points, and share of high ones."""
+    margin, half_width, max_height, share, min_height = limits
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
         y, z, up, kept = points[mine, 0], points[mine, 1], height[mine], keep[mine]
         for p in range(len(y)):
             kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
         for side in range(2):
-            w, h, distance = _plane(y if side == 0 else -y, z, up, kept)
+            sign = 1 - 2 * side
+            w, h, distance = _plane(y, z, up, kept, sign)
             walls[k, side] = w, h
             slope = h / max(distance, 0.2)
             for p in range(len(y)):
                 if (y[p] >= 0) == (side == 0):
                     kept[p] = kept[p] and z[p] >= slope * abs(y[p]) + margin
         _drop_noise(y, z, kept, share)
-        n[k] = kept.sum()
-        if n[k]:
-            tall[k] = np.quantile(up[kept], 0.9)
+        for p in range(len(y)):
+            n[k] += kept[p]
+            tall[k] += kept[p] and up[p] >= min_height
+        tall[k] /= max(n[k], 1)
 
 
 @compiled
-def _plane(y: Values, z: Values, up: Values, canopy: Flags) -> tuple[float, float, float]:
-    """Wall w and elevation h of the inter-row on the side of positive y (Eq. 6–9), and the inter-row's distance.
+def _plane(y: Values, z: Values, up: Values, canopy: Flags, sign: int) -> tuple[float, float, float]:
+    """Wall w and elevation h of the inter-row on the side of a sign of y (Eq. 6–9), and the inter-row's distance.
 
     The elevation is that of the inter-row's middle: the plane through it must not be steeper than the ground.
     """
     walls, levels = np.zeros(round(1 / BIN)), np.zeros(round(3 / BIN))
-    middle = up[canopy].mean() if canopy.any() else 0.0
+    total, leaves = 0.0, 0
+    for p in range(len(y)):
+        if canopy[p]:
+            total, leaves = total + up[p], leaves + 1
     for p in range(len(y)):
         # The upper half of a canopy seen from above is its top rather than its walls.
-        if y[p] >= 0 and canopy[p] and up[p] <= middle:
-            walls[min(int(y[p] / BIN), len(walls) - 1)] += 1
+        if sign * y[p] >= 0 and canopy[p] and up[p] * leaves <= total:
+            walls[min(int(abs(y[p]) / BIN), len(walls) - 1)] += 1
     wall = _peak(walls) * BIN
     way, n = 0.0, 0
     for p in range(len(y)):
-        if y[p] > wall and abs(up[p]) < GROUND:
+        if sign * y[p] > wall and abs(up[p]) < GROUND:
             levels[min(max(int((z[p] + 1.5) / BIN), 0), len(levels) - 1)] += 1
-            way, n = way + y[p], n + 1
+            way, n = way + abs(y[p]), n + 1
     return wall, _peak(levels) * BIN - 1.5 if n else 0.0, way / n if n else 1.0
 
 
@@ -176,7 +181,10 @@ def _drop_noise(y: Values, z: Values, kept: Flags, share: float) -> None:
     for p in range(len(y)):
         if kept[p]:
             i, j = int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1
-            kept[p] = cells[i - 1 : i + 2, j - 1 : j + 2].sum() >= least
+            around = 0.0
+            for a in range(-1, 2):
+                around += cells[i + a, j - 1] + cells[i + a, j] + cells[i + a, j + 1]
+            kept[p] = around >= least
 
 
 def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]:

@@ -25,6 +25,8 @@ FLAT = 1e-12
 """Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""
+BLUNT = 0.5
+"""Cosine of the turn up to which a corner of a grown outline stays one; sharper ones are cut."""
 LONGEST = 256
 """An outline of more edges is first simplified from outside: no two edges in a row turn by less than 360°/LONGEST."""
 
@@ -100,7 +102,7 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
     Returns
     -------
     points : array (k, 2)
-        Vertices of the outlines, section after section; a corner becomes an edge.
+        Vertices of the outlines, section after section; sharp corners are cut.
     start : array (m + 1,)
         Where each section's begin.
     feet : array (m, 3, 2)
@@ -644,12 +646,24 @@ def _grow_all(
         body[:n], body[n], body[n + 1] = points[start[k] : start[k + 1]], feet[k, 1], feet[k, 2]
         body = body[_sorted(body)]
         ring = body[_hull(body)]
-        at = 2 * (start[k] + 2 * k)
+        at = size = 2 * (start[k] + 2 * k)
         for i in range(len(ring)):
-            edge = ring[i] - ring[i - 1]
-            outward = -1j * edge / abs(edge) * reach[k] if edge != 0 else 0j
-            out[at + 2 * i], out[at + 2 * i + 1] = ring[i - 1] + outward, ring[i] + outward
-        sizes[k] = 2 * len(ring)
+            one, two = _outward(ring[i - 1], ring[i]), _outward(ring[i], ring[(i + 1) % len(ring)])
+            turn = one.real * two.real + one.imag * two.imag
+            if turn >= BLUNT:
+                out[size] = ring[i] + reach[k] * (one + two) / (1 + turn)
+                size += 1
+            else:
+                out[size], out[size + 1] = ring[i] + reach[k] * one, ring[i] + reach[k] * two
+                size += 2
+        sizes[k] = size - at
+
+
+@compiled
+def _outward(a: complex, b: complex) -> complex:
+    """Unit normal to the right of a → b, 0 where they coincide."""
+    edge = b - a
+    return -1j * edge / abs(edge) if edge != 0 else 0j
 
 
 @compiled

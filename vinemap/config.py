@@ -141,7 +141,7 @@ class CanopyOptions(Options):
     min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
     min_points: int = Field(8, ge=3, description="canopy points of a section")
     min_share: Share = Field(0.15, description="share of the median section's points that a section has")
-    min_height: float = Field(0.8, ge=0, le=5, description="90% height of a section (m)")
+    min_height: float = Field(0.8, ge=0, le=5, description="height of a section's highest tenth (m)")
 
     @model_validator(mode="after")
     def _ordered(self) -> CanopyOptions:

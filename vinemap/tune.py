@@ -40,6 +40,8 @@ REFERENCE = {"width": 0.4, "step": 0.1}
 """Sections against which models are held."""
 OUTLINE = 30
 """Vertices with which a polygon is as good as the foliage's outline."""
+PANELS = {"good": (0, 1), "under": (0, 1), "over": (0, 1), "reduction": (-0.1, 0.1), "quality": (-0.5, 1.1)}
+"""What is drawn of a model, and between which bounds."""
 GENERATIONS = 12
 """Of the differential evolution."""
 LENGTH = 128.0
@@ -47,17 +49,18 @@ LENGTH = 128.0
 
 
 class Score(NamedTuple):
-    """Indices of a model at every section of the reference (n,); R is the mean of the model's own sections."""
+    """Indices of a model at every section of the reference (n,), R at the model's own (m,)."""
 
     good: Values
     under: Values
     over: Values
-    reduction: float
+    reduction: Values
 
     @property
     def quality(self) -> Values:
-        """Q (n,) of Eq. 23."""
-        return self.good - (self.under + self.over) + self.reduction
+        """Q (n,) of Eq. 23, with the mean of R."""
+        mean = self.reduction.mean() if len(self.reduction) else 0.0
+        return self.good - (self.under + self.over) + mean
 
 
 def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b: float, c: int, foot: str) -> Score:
@@ -70,8 +73,7 @@ def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b
     shared, mine, area = (
         np.asarray(shapely.area(shape)) for shape in (shapely.intersection(drawn, outlines), drawn, outlines)
     )
-    reduction = float(model.table["reduction"].mean()) if len(model.table) else 0.0
-    return Score(*modelling_indices(shared, mine, area), reduction)
+    return Score(*modelling_indices(shared, mine, area), model.table["reduction"].to_numpy())
 
 
 def _model(points: PointCloud, found: RowMap, sections: dict[str, float], c: int, foot: str) -> CanopyModel:
@@ -106,24 +108,18 @@ def reference_model(points: PointCloud, found: RowMap) -> CanopyModel:
 
 
 def search(points: PointCloud, found: RowMap, *, seed: int = 0, generations: int = 12) -> tuple[float, float, int]:
-    """The [a, b, c] of the highest mean Q within the thesis's ranges, by differential evolution."""
+    """The [a, b, c] of the highest mean Q within the thesis's ranges, to the centimetre, by differential evolution."""
     reference = reference_model(points, found)
 
-    def loss(x: Values) -> float:
-        value = score(points, found, reference, float(x[0]), float(x[1]), round(float(x[2])), "foliage")
-        return -float(value.quality.mean())
+    def rounded(x: Values) -> tuple[float, float, int]:
+        return round(float(x[0]), 2), round(float(x[1]), 2), round(float(x[2]))
 
-    best = differential_evolution(
-        loss,
-        BOUNDS,
-        integrality=[False, False, True],
-        seed=seed,
-        maxiter=generations,
-        popsize=6,
-        polish=False,
-        tol=1e-3,
-    ).x
-    return round(float(best[0]), 2), round(float(best[1]), 2), round(float(best[2]))
+    def loss(x: Values) -> float:
+        return -float(score(points, found, reference, *rounded(x), "foliage").quality.mean())
+
+    integrality = [False, False, True]
+    options = {"seed": seed, "maxiter": generations, "popsize": 6, "polish": False, "tol": 1e-3, "x0": THESIS}
+    return rounded(differential_evolution(loss, BOUNDS, integrality=integrality, **options).x)
 
 
 def some_rows(found: RowMap, length: float) -> RowMap:
@@ -135,15 +131,15 @@ def some_rows(found: RowMap, length: float) -> RowMap:
 
 
 def draw(scores: dict[str, Score], path: Path) -> None:
-    """Draw the histograms of G, U, O and Q of models (Fig. 3.9)."""
+    """Draw the histograms of G, U, O, R and Q of models (Fig. 3.9)."""
     from matplotlib.figure import Figure  # a tool of development
 
-    figure = Figure(figsize=(14, 3.2 * len(scores)), layout="constrained")
-    panels = figure.subplots(len(scores), 4, squeeze=False)
+    figure = Figure(figsize=(17, 3.2 * len(scores)), layout="constrained")
+    panels = figure.subplots(len(scores), 5, squeeze=False)
     for line, (name, one) in zip(panels, scores.items(), strict=True):
-        for axes, key in zip(line, ("good", "under", "over", "quality"), strict=True):
+        for axes, key in zip(line, PANELS, strict=True):
             values = getattr(one, key)
-            axes.hist(values, bins=np.linspace(-0.5 if key == "quality" else 0.0, 1.1, 56), color="tab:green")
+            axes.hist(np.clip(values, *PANELS[key]), bins=np.linspace(*PANELS[key], 56), color="tab:green")
             axes.set_title(f"{name}: {key}, mean {values.mean():.3f}, σ {values.std():.3f}", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
@@ -170,9 +166,9 @@ def main(cloud: Path, boundary: Path | None, parcel: str | None, crs: str | None
     for name, (a, b, c, foot) in models.items():
         scores[f"{name} [{a:g}, {b:g}, {c}]"] = score(points, found, reference, a, b, c, foot)
     for name, one in scores.items():
-        means = (values.mean() for values in (one.good, one.under, one.over))
+        good, under, over, reduction = (np.mean(v) for v in (one.good, one.under, one.over, one.reduction))
         click.echo(
-            f"{name}: " + "G {:.3f}, U {:.3f}, O {:.3f}, ".format(*means) + f"R {one.reduction:.3f}, "
+            f"{name}: G {good:.3f}, U {under:.3f}, O {over:.3f}, R {reduction:.3f}, "
             f"Q {one.quality.mean():.3f} ± {one.quality.std():.3f}"
         )
     draw(scores, out)
