@@ -140,7 +140,7 @@ def draw(scores: dict[str, Score], path: Path) -> None:
         for axes, key in zip(line, PANELS, strict=True):
             values = getattr(one, key)
             axes.hist(np.clip(values, *PANELS[key]), bins=np.linspace(*PANELS[key], 56), color="tab:green")
-            axes.set_title(f"{name}: {key}, mean {values.mean():.3f}, σ {values.std():.3f}", fontsize=9)
+            axes.set_title(f"{name}\n{key}: mean {values.mean():.3f}, σ {values.std():.3f}", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
 
