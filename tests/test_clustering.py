@@ -115,6 +115,17 @@ def test_rows_end_at_a_track_but_not_at_missing_vines():
     assert cluster_rows(points, track_width=50)["cluster"].nunique() == 5
 
 
+def test_rows_do_not_reach_over_their_headland():
+    """Rows that end together, and in line with one of them a hedge; a row that outlasts its neighbours goes on."""
+    rows = [np.array([[0, 2.5 * k], [30, 2.5 * k]]) for k in range(5)]
+    hedge = np.array([[42, 5.2], [52, 5.2]])
+    assert_rows_are_kept_apart(cluster_rows(key_points([*rows, hedge])), 6)
+    longer = [np.array([[0, 2.5 * k], [30 + 8 * k, 2.5 * k]]) for k in range(5)]
+    points = key_points(longer)
+    gap = (points["truth"] == 3) & points.geometry.x.between(40, 50)
+    assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 5)
+
+
 def test_the_thesis_ellipse_finds_clean_rows_and_stops_at_gaps():
     rows = [np.array([[0, 2.5 * k], [40, 2.5 * k]]) for k in range(4)]
     assert_rows_are_kept_apart(cluster_rows(key_points(rows), method="ellipse"), 4)

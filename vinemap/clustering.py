@@ -246,10 +246,11 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
 
 
 def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
-    """Whether the gap between two ends (k, 2) goes on through the neighbouring rows.
+    """Whether the gap between two ends (k, 2) goes on through the neighbouring rows, three on each side.
 
-    It is a track if most of the three rows on each side stand before the gap and after it, and three in four of
-    those are empty beside it.
+    It is a track if most of them stand before it and after it, and three in four of those are empty beside it. It is
+    a headland, beyond which stands something else, if at least two stand on one side of it, three in four of those
+    are empty beside it, and as many don't stand on its other side.
     """
     tree = cKDTree(xy)
     out = np.zeros(len(pairs), dtype=bool)
@@ -264,13 +265,13 @@ def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width
         x = near @ gap / length
         rank = np.rint((gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing)
         beside = [x[rank == r] for r in (-3, -2, -1, 1, 2, 3)]
-        beside = [row for row in beside if _covered(row, -FLANK, length + FLANK) > 0.2]
-        empty = [
-            _covered(row, 0.5, length - 0.5) < 0.3
-            for row in beside
-            if min(_covered(row, -FLANK, 0), _covered(row, length, length + FLANK)) > 0.5
-        ]
-        out[k] = len(empty) > 0.5 * len(beside) and np.mean(empty) >= 0.75
+        stands = np.array([[_covered(r, -FLANK, 0), _covered(r, length, length + FLANK)] for r in beside]) > 0.5
+        empty = np.array([_covered(r, 0.5, length - 0.5) < 0.3 for r in beside])
+        there = stands.any(axis=1) | ~empty
+        through = stands.all(axis=1)
+        out[k] = through.sum() > 0.5 * there.sum() and empty[through].mean() >= 0.75
+        for here, beyond in (stands.T, stands.T[::-1]):
+            out[k] |= here.sum() > 1 and empty[here].mean() >= 0.75 and beyond[here].mean() <= 0.25
     return out
 
 
