@@ -126,6 +126,18 @@ def test_rows_do_not_reach_over_their_headland():
     assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 5)
 
 
+def test_straight_rows_are_not_joined_by_a_bend():
+    """Two rows of blocks of their own directions, in line with each other's ends; rows on an arc of the same turn."""
+    turn = np.radians(24)
+    away = np.array([[0, 0], [25.0, 0]]) @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    rows = [np.array([[-25, 0], [0.0, 0]]), np.array([10.5, 2.3]) + away]
+    assert_rows_are_kept_apart(cluster_rows(key_points(rows)), 2)
+    angle = np.linspace(0, 1.4, 200)
+    arc = key_points([np.column_stack([30 * np.cos(angle), 30 * np.sin(angle)])])
+    bearing = np.arctan2(arc.geometry.y, arc.geometry.x)
+    assert_rows_are_kept_apart(cluster_rows(arc[(bearing < 0.5) | (bearing > 0.9)].reset_index(drop=True)), 1)
+
+
 def test_the_thesis_ellipse_finds_clean_rows_and_stops_at_gaps():
     rows = [np.array([[0, 2.5 * k], [40, 2.5 * k]]) for k in range(4)]
     assert_rows_are_kept_apart(cluster_rows(key_points(rows), method="ellipse"), 4)

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 TANGENT_LENGTH = 5.0
 """Metres of a piece's end that tell its tangent."""
+BEND_LENGTH = 10.0
+"""Metres of a piece's end that tell how it bends."""
+KINK = 0.2
+"""Radians that a gap may turn a row beyond what the pieces on both sides do."""
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 FLANK = 4.0
@@ -156,6 +160,8 @@ class _Ends(NamedTuple):
     field: Values
     """Outward unit vectors (2 m, 2) of the row field there."""
     spacing: Values
+    bend: Values
+    """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
 
 
 def _components(graph: coo_array) -> Labels:
@@ -168,7 +174,7 @@ def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, graph:
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
     n = 2 * (len(first) - 1)
-    out = _Ends(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n))
+    out = _Ends(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
     for p in range(len(first) - 1):
         members = order[first[p] : first[p + 1]]
         s = position[members]
@@ -184,6 +190,10 @@ def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, graph:
             # An end lies on its piece's axis rather than on the outermost point.
             out.xy[end] = middle + ((xy[near] - middle) @ tangent).max() * tangent
             out.spacing[end] = np.median(spacing[near])
+            if s[-1] >= BEND_LENGTH:
+                offset = xy[members[depth <= BEND_LENGTH]] - middle
+                left = tangent[0] * offset[:, 1] - tangent[1] * offset[:, 0]
+                out.bend[end] = 2 * np.polyfit(offset @ tangent, left, 2)[0]
     return out
 
 
@@ -239,9 +249,21 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
     ahead = np.minimum((ends.field[a] * gap).sum(axis=1), -(ends.field[b] * gap).sum(axis=1))
     facing = (ahead >= 0.7 * length - OVERLAP) & ((ends.field[a] * ends.field[b]).sum(axis=1) < -0.7)
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
-    fits = facing & (lateral <= gate)
+    fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
     cost = length[fits] + 10 * lateral[fits]
     out: NDArray[np.int64] = pairs[fits][np.argsort(cost, kind="stable")]
+    return out
+
+
+def _kinked(ends: _Ends, a: Labels, b: Labels, length: Values) -> NDArray[np.bool_]:
+    """Whether two ends (k,) could only be joined by a bend that neither of their pieces, where long enough, has."""
+    (ax, ay), (bx, by) = ends.tangent[a].T, -ends.tangent[b].T
+    turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+    bends = np.stack([ends.bend[a], -ends.bend[b]])
+    known = np.isfinite(bends)
+    bend = np.where(known, bends, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    # Tangents are those of the middle of the pieces' last metres.
+    out: NDArray[np.bool_] = known.any(axis=0) & (np.abs(turn - bend * (length + TANGENT_LENGTH)) > KINK)
     return out
 
 

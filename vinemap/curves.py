@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import geopandas as gpd
 import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from vinemap.raster import Raster, sample_across
 from vinemap.row_frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
@@ -205,29 +207,40 @@ def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
 
 
 def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
-    """Whether a row has about as much canopy as most: no wire between posts, no hedge."""
-    if len(rows) < 3:
-        return np.ones(len(rows), dtype=bool)
-    order = np.argsort(rows["amount"].to_numpy())
-    half = np.cumsum(rows.length.to_numpy()[order]) >= 0.5 * rows.length.sum()
-    typical = rows.iloc[order[np.argmax(half)]]
-    thin = rows["amount"] < LEAST_AMOUNT * typical["amount"]
-    wide = rows["width"] > MOST_WIDTH * typical["width"]
-    out: NDArray[np.bool_] = ~(thin | wide).to_numpy()
+    """Whether a row has about as much canopy as most of those that it stands among: no wire between posts, no hedge."""
+    out = np.ones(len(rows), dtype=bool)
+    beside = coo_array((np.ones(len(pairs := _neighbours(rows))), tuple(pairs.T)), shape=(len(rows), len(rows)))
+    group = connected_components(beside, directed=False)[1]
+    length, amount, width = (np.asarray(v) for v in (rows.length, rows["amount"], rows["width"]))
+    for members in (np.flatnonzero(group == g) for g in np.unique(group)):
+        if len(members) < 3:
+            continue
+        order = members[np.argsort(amount[members])]
+        half = np.cumsum(length[order]) >= 0.5 * length[members].sum()
+        typical = order[np.argmax(half)]
+        out[members] = amount[members] >= LEAST_AMOUNT * amount[typical]
+        out[members] &= width[members] <= MOST_WIDTH * width[typical]
     return out
 
 
 def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     """Whether another row of about the same direction lies a spacing from each."""
-    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     out = np.zeros(len(rows), dtype=bool)
+    out[_neighbours(rows)[:, 0]] = True
+    return out
+
+
+def _neighbours(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
+    """Pairs (k, 2) of rows of about the same direction that lie no more than a spacing apart."""
+    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     if len(rows) < 2:
-        return out
+        return np.empty((0, 2), dtype=np.int64)
     chord = np.array([np.diff(shapely.get_coordinates(line)[[0, -1]], axis=0)[0] for line in lines])
     angle = np.arctan2(chord[:, 1], chord[:, 0])
-    # Away from the rows their spacing is a guess: it is the parcel's that counts.
-    reach = BESIDE * np.minimum(rows["spacing_m"], rows["spacing_m"].median()).to_numpy()
-    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=reach)
+    # Away from rows the spacing is a guess: the smaller of two counts.
+    spacing = rows["spacing_m"].to_numpy()
+    i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=BESIDE * spacing)
+    beside = (i != j) & (shapely.distance(lines[i], lines[j]) <= BESIDE * np.minimum(spacing[i], spacing[j]))
     parallel = np.abs(np.sin(angle[i] - angle[j])) < np.sin(np.radians(20))
-    out[i[parallel & (i != j)]] = True
+    out: NDArray[np.int64] = np.column_stack([i, j])[parallel & beside]
     return out

@@ -55,6 +55,8 @@ REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
+LEAST_CONTRAST = 0.6
+"""Contrast of a row's canopy to what lies beside it, below which it is a bush or a hedge."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
 
@@ -250,7 +252,7 @@ def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int
 
 
 def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
-    """Cut a curve to where its canopy begins and ends."""
+    """Cut a curve to where its canopy begins and ends; None where there is none, or none with free ground beside it."""
     profile = image.sum(axis=1) * CELL
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
@@ -273,6 +275,8 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     aside = max(1, canopy.shape[1] // 8)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
+    if contrast < LEAST_CONTRAST:
+        return None
     return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
 
 
