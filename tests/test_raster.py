@@ -6,16 +6,16 @@ import rasterio
 from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.raster import Grid, Raster, cell_of, coarser, count, grid_over, sample, write_cog
+from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample, write_cog
 
 UTM = CRS.from_epsg(32632)
 
 
-def test_grid_holds_its_points_and_counts_them():
+def test_grid_holds_its_points():
     xy = np.random.default_rng(0).uniform([1000.3, 2000.7], [1010.9, 2005.2], (500, 2))
     grid = grid_over(xy, resolution=0.5)
     cells = cell_of(xy, grid)
-    assert count(cells, grid).sum() == 500
+    assert cells.max() < grid.ny * grid.nx
     x, y = grid.centres()
     i, j = np.divmod(cells, grid.nx)
     assert np.abs(x[j] - xy[:, 0]).max() <= 0.25 + 1e-9

@@ -1,4 +1,4 @@
-"""North-up rasters: binning points into cells, sampling, and Cloud Optimized GeoTIFF."""
+"""North-up rasters: cells of points, sampling, and Cloud Optimized GeoTIFF."""
 
 from __future__ import annotations
 
@@ -98,11 +98,6 @@ def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int64]:
     out = np.empty(len(points), dtype=np.int64)
     in_threads(lambda part: _cells(*part, points, grid, out), stretches(len(points)))
     return out
-
-
-def count(cells: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
-    """Points in each cell, (ny, nx)."""
-    return np.bincount(cells, minlength=grid.ny * grid.nx).reshape(grid.shape).astype(float)
 
 
 def block_sum(values: NDArray[np.floating], k: int) -> NDArray[np.floating]:
