@@ -40,11 +40,11 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff format --check
 	@$(BIN)/python -m mypy
 
-accuracy: $(READY) ## Measure rows on simulated vineyards, fill README's table: make accuracy [FAMILY="curved fan"]
+accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill README's tables: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--readme README.md)
 
 tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
-	@$(BIN)/python -m vinemap.tune $(CLOUD) $(if $(BOUNDARY),--boundary $(BOUNDARY)) $(if $(PARCEL),--parcel "$(PARCEL)")
+	@$(BIN)/python -m vinemap.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")
 
 clean: ## Remove .venv and the tools' caches; surveys and products stay
 	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist

@@ -64,6 +64,13 @@ def test_classified_clouds_and_plain_meshes_on_demand(tmp_path, survey):
     assert b"KHR_mesh_quantization" in light
     assert b"KHR_mesh_quantization" not in plain
     assert len(light) < 0.7 * len(plain)
+    # Sections far apart leave no point out.
+    (tmp_path / "far.yaml").write_text("sections: {step: 1.5}\n")
+    done = vinemap("run", survey, "--out", "far", "--classified", "--settings", "far.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    far = laspy.read(tmp_path / "far" / "small_classified.laz")
+    leaves, others = ((np.asarray(cloud.classification) == 5).sum() for cloud in (las, far))
+    assert others > 0.97 * leaves
     record = json.loads((tmp_path / "asked" / "run.json").read_text())
     assert record["settings"]["product"] == {"classified": True, "plain": True}
     assert "small_classified.laz" in record["files"]

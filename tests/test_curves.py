@@ -143,7 +143,9 @@ def test_ordering_with_gaps_and_any_sense_of_direction():
 def test_a_bush_as_long_as_a_row_is_none():
     """A row has free ground beside it."""
     bush = scene([np.array([[0, 0], [12.0, 0]])], width=1.5)
-    courses = gpd.GeoDataFrame({"spacing_m": [4.5]}, geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])], crs=UTM)
+    courses = gpd.GeoDataFrame(
+        {"spacing_m": [4.5], "alone": [True]}, geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])], crs=UTM
+    )
     heights = bush.cloud.xyz[:, 2] - 7
     assert len(fit_rows(courses, bush.cloud, heights, bush.cover, bush.dtm)[0]) == 0
     row = scene([np.array([[0, 0], [12.0, 0]])], width=0.7)

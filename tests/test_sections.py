@@ -213,7 +213,7 @@ def test_feet_stand_where_foliage_begins():
     canopy, feet = find_feet(many_sections(points))
     assert np.abs(feet[:, 0, 1] - 0.55).max() < 0.1
     assert np.abs(np.diff(feet[:, 0, 1])).max() < 0.02  # neighbours share what they see
-    # Four fifths of the points near the foot lie between its sides.
+    # Three fifths of the points near the foot lie between its sides.
     assert np.abs(feet[:, 1:, 0] - [0.18, -0.18]).max() < 0.07
     assert len(canopy.points) > 0.97 * 80 * 40
 
@@ -245,6 +245,9 @@ def test_volumes_of_rows_and_of_hectares():
     rows = summarise_rows(rows_frame([np.array([[0, 0], [10.0, 0]])]), table, step=0.25)
     assert rows["volume_m3"].tolist() == pytest.approx([0.75 * 10])
     assert rows["bottom_m"].tolist() == [0.5]
+    # A short row's stations lie further apart than a step.
+    far = table.iloc[:2].assign(position_m=[0.0, 0.3])
+    assert summarise_rows(rows, far, step=0.25)["volume_m3"].tolist() == pytest.approx([0.75 * 0.3])
     # Where sections lack, the foliage ends half a step past the last one.
     left = summarise_rows(rows, table.drop(index=range(10, 20)).reset_index(drop=True), step=0.25)
     assert left["volume_m3"].tolist() == pytest.approx([0.75 * (10 - 11 * 0.25 + 0.25)])
@@ -264,6 +267,8 @@ def test_any_sections_give_a_defined_model(sections):
     assert len(model.polygons) == len(model.table) == len(model.canopy.row_id)
     assert np.isfinite(model.polygons).all()
     assert np.isfinite(model.table.drop(columns="geometry").to_numpy()).all()
+    assert (model.table["n_points"] >= 3).all()
+    assert (model.table["lwa_m2_ha"] >= 0).all()
 
 
 def test_a_million_points_in_a_section():

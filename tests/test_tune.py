@@ -27,7 +27,7 @@ def test_better_models_score_higher(cloud, found):
     fine = score(cloud, found, reference, 0.4, 0.25, 7, "foliage")
     assert fine.good.mean() > 0.93
     assert fine.over.mean() < 0.09
-    assert fine.quality == pytest.approx(fine.good - fine.under - fine.over + fine.reduction.mean())
+    assert 0.8 < fine.quality.mean() < 1
     # Feet on the soil take in the void; sections far apart cut across bends and gaps.
     assert score(cloud, found, reference, 0.4, 0.25, 7, "soil").over.mean() > fine.over.mean() + 0.2
     coarse = score(cloud, found, reference, 0.4, 2.0, 7, "foliage")
@@ -39,19 +39,20 @@ def test_better_models_score_higher(cloud, found):
 
 
 def test_search_keeps_to_its_ranges_and_finds_no_worse_than_it_began(cloud, found):
-    best = search(cloud, found, generations=1)
+    reference = reference_model(cloud, found)
+    best = search(cloud, found, reference, generations=1)
     for value, (low, high) in zip(best, BOUNDS, strict=True):
         assert low <= value <= high
     assert isinstance(best[2], int)
-    reference = reference_model(cloud, found)
     ours, thesis = (score(cloud, found, reference, *model, "foliage") for model in (best, (0.4, 0.25, 7)))
     assert ours.quality.mean() >= thesis.quality.mean() - 0.01
 
 
-def test_the_command_says_what_it_found_and_draws(vineyard, tmp_path, monkeypatch):
-    monkeypatch.setattr("vinemap.tune.GENERATIONS", 0)
+def test_the_command_says_what_it_found_and_draws(vineyard, tmp_path):
     cloud = write_survey(vineyard, tmp_path)
-    run = CliRunner().invoke(main, [str(cloud), "--length", "20", "--out", str(tmp_path / "made" / "tune.png")])
+    run = CliRunner().invoke(
+        main, [str(cloud), "--length", "20", "--generations", "0", "--out", str(tmp_path / "made" / "tune.png")]
+    )
     assert run.exit_code == 0, run.output
     lines = run.output.splitlines()
     assert lines[1].startswith("the thesis's [0.4, 0.25, 7]: G 0.9")

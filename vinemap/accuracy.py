@@ -146,7 +146,7 @@ CANOPY_COLUMNS: Columns = {
         "G − U − O": Measure(lambda e: mean(e.good) - mean(e.under) - mean(e.over), 0.65, at_least=True),
     },
     "the thesis's feet": {"G − U − O": Measure(lambda e: mean(e.soil), -np.inf, at_least=True)},
-    "against the points' outline": {"O": Measure(lambda e: mean(e.hull_over), 0.09)},
+    "against the foliage's outline": {"O": Measure(lambda e: mean(e.hull_over), 0.09)},
     "height m": {
         "mean": Measure(lambda e: mean(e.height), 0.05),
         "worst row": Measure(lambda e: quantile(np.abs(e.height), 1), 0.05),

@@ -35,7 +35,7 @@ FOOT_BIN = 0.025
 FOOT_RANKS = 0.02, 0.1
 """Orders of the heights through which the line is drawn that falls to no points at the foot."""
 FOOT_BAND, FOOT_SPREAD = 0.15, 0.8
-"""Metres above the foot whose points tell how wide the canopy stands on it, and the quantile of their spread."""
+"""Metres above the foot whose points tell how wide the canopy stands on it, and the quantile that is its side."""
 
 
 def separate_canopy(

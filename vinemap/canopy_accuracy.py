@@ -36,7 +36,7 @@ class CanopyErrors(NamedTuple):
     under: Array
     over: Array
     hull_over: Array
-    """O (m,) against the outline of the foliage's points."""
+    """O (m,) against the outline that the points tell."""
     soil: Array
     """G − U − O (m,) of the thesis's polygons, whose feet stand on the soil, against the true foliage."""
     height: Array

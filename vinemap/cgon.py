@@ -95,7 +95,7 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
     points, start : array_like of shape (n, 2), (m + 1,)
         As in :func:`peel_sections`.
     feet : array_like of shape (m, 3, 2)
-        v1 (bottom, middle), v2 (left foot, positive y) and vc (right foot), m.
+        v1 (bottom, middle), v2 (right foot, positive y) and vc (left foot), m.
     reach : array_like of shape (m,)
         Metres by which edges are moved outward.
 

@@ -49,7 +49,7 @@ def commands() -> None:
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
 @click.option("--origin", type=_Origin(), help="Origin of the local frame {Main}; the parcel's corner by default.")
 @click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
-@click.option("--classified", is_flag=True, help="Write the cloud with a class and a row for every point, too.")
+@click.option("--classified", is_flag=True, help="Write the points with a class and a row each, too.")
 @click.option("--plain", is_flag=True, help="Write meshes for readers of glTF that know no extension: larger files.")
 def run(
     cloud: Path,

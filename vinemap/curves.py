@@ -81,7 +81,7 @@ def trace_rows(
     Returns
     -------
     GeoDataFrame
-        LineString with ``spacing_m``.
+        LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
     """
     records = []
     for _, points in key_points.groupby("cluster"):
@@ -104,8 +104,9 @@ def trace_rows(
     rows = rows[~_repeated(rows)]
     rows = rows[_like_the_others(rows)]
     least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
-    odd = ~_accompanied(rows) & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
-    return rows.loc[~odd, ["spacing_m", "geometry"]].reset_index(drop=True)
+    alone = ~_accompanied(rows)
+    odd = alone & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
+    return rows.assign(alone=alone).loc[~odd, ["spacing_m", "alone", "geometry"]].reset_index(drop=True)
 
 
 def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -> Values:

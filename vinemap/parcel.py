@@ -203,7 +203,7 @@ def map_parcel(
             plain = settings.product.plain
             write_product(draft, parcel, layers, (found.dtm, chm), found.field, meshes, points, plain=plain)
             if settings.product.classified:
-                classes = classify_points(points, heights, leaves)
+                classes = classify_points(points, heights, _all_leaves(leaves, points, found, settings))
                 write_classified(points, heights, *classes, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
@@ -262,13 +262,24 @@ def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyMo
     outline, start, grown = grow(canopy.points, canopy.start, feet, reach)
     on_foliage = settings.polygon.foot == "foliage"
     fixed = grown if on_foliage else soil
-    model = enclose(outline, start, fixed, c=settings.polygon.c, share=0, slide=on_foliage)
-    valid = model.valid
+    model = enclose(outline, start, fixed, c=settings.polygon.c, share=0.0, slide=on_foliage)
+    # The foot that the sections around tell may leave a young vine nothing.
+    valid = model.valid & (np.diff(canopy.start) >= max(3, settings.canopy.min_points // 2))
     canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
     polygons, foliage = model.polygon[valid], model.hull_area[valid]
     indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
     table = measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
     return CanopyModel(canopy, polygons, table, leaves)
+
+
+def _all_leaves(leaves: Sections, points: PointCloud, found: RowMap, settings: Settings) -> Sections:
+    """Canopy points of sections that leave nothing between them."""
+    options = settings.sections
+    if options.step <= options.width:
+        return leaves
+    dense = options.model_copy(update={"step": options.width}).model_dump()
+    sections = cut_sections(points, found.heights, found.rows, found.gaps, found.dtm, **dense)
+    return separate_canopy(sections, **settings.canopy.model_dump())[0]
 
 
 def _corner(dtm: Raster) -> Origin:

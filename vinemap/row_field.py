@@ -218,6 +218,9 @@ def _strongest(
                 total += power[row, j] if j else 0.5 * power[row, j]
                 if lowest <= square <= highest and power[row, j] > most:
                     most, best_i, best_j = power[row, j], i, j
+        if most < 0:  # no bin lies in so narrow a band
+            y[k], x[k], strength[k] = 0.0, 1 / longest, 0.0
+            continue
         held = 0.0
         for harmonic in range(1, harmonics + 1):
             held += _lobe(power, harmonic * best_i, harmonic * best_j, reach)

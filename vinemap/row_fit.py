@@ -56,7 +56,7 @@ REACH = 0.2
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
 LEAST_CONTRAST = 0.6
-"""Contrast of a row's canopy to what lies beside it, below which it is a bush or a hedge."""
+"""Contrast of a lone row's canopy to what lies beside it, below which it is a bush or a hedge."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
 
@@ -96,7 +96,7 @@ def fit_rows(
     Parameters
     ----------
     courses : GeoDataFrame
-        LineString with ``spacing_m``.
+        LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
     cloud : PointCloud
         The parcel's points.
     heights : (n,) array
@@ -130,8 +130,8 @@ def fit_rows(
     )
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
-    for fit, spacing in zip(fits, courses["spacing_m"], strict=True):
-        if fit is None:
+    for fit, spacing, alone in zip(fits, courses["spacing_m"], courses["alone"], strict=True):
+        if fit is None or (alone and fit.contrast < LEAST_CONTRAST):
             continue
         empty = np.column_stack([fit.runs[:-1, 1], fit.runs[1:, 0]])
         support = 1 - np.diff(empty, axis=1).sum() / fit.runs[-1, 1]
@@ -252,7 +252,7 @@ def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int
 
 
 def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
-    """Cut a curve to where its canopy begins and ends; None where there is none, or none with free ground beside it."""
+    """Cut a curve to where its canopy begins and ends; None where there is none."""
     profile = image.sum(axis=1) * CELL
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
@@ -275,8 +275,6 @@ def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
     aside = max(1, canopy.shape[1] // 8)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
-    if contrast < LEAST_CONTRAST:
-        return None
     return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
 
 

@@ -143,14 +143,16 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     """Give rows the means of their sections, and their foliage's ``volume_m3``; NaN where there is none.
 
     The means are ``height_m``, ``width_m``, ``bottom_m``, ``trv_m3_ha`` and ``lwa_m2_ha``. The volume is that of the
-    foliage's outlines, each reaching half way to its neighbours, half a ``step`` at the
-    most.
+    foliage's outlines, each reaching half way to its neighbours, or half a ``step``
+    into a gap.
     """
     groups = sections.groupby("row_id")
     names = ["height_m", "width_m", "bottom_m", "trv_m3_ha", "lwa_m2_ha"]
     means = groups[names].mean().reindex(rows["row_id"])
     position, row = sections["position_m"].to_numpy(), sections["row_id"].to_numpy()
-    way = np.where(np.diff(row) == 0, np.minimum(np.diff(position), step), 0.0)
+    away = np.diff(position)
+    # Stations of a short row may lie up to half a step further apart; what lies further apart is a gap.
+    way = np.where(np.diff(row) == 0, np.where(away <= 1.5 * step, away, step), 0.0)
     length = (np.concatenate([[0.0], way]) + np.concatenate([way, [0.0]]))[: len(row)] / 2
     volume = (sections["area_m2"] * length).groupby(row).sum().reindex(rows["row_id"])
     return rows.assign(**{name: means[name].to_numpy() for name in names}, volume_m3=volume.to_numpy())

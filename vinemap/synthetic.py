@@ -245,7 +245,7 @@ def simulate(
 def foliage_outlines(foliage: Foliage, *, n: int = 24) -> Array:
     """Outlines (stations, 2 n, 2) of the foliage across its rows, leaves' reach included: metres left and above ground.
 
-    They run counter-clockwise for one who looks along the row with its left at his right.
+    They run counter-clockwise where what lies to the left is drawn to the right.
     """
     relative = np.linspace(0, 1, n)
     reach = EDGE / 2

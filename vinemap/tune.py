@@ -1,8 +1,8 @@
 """Search of a model's [a, b, c] by its quality score, as in section 3.3: ``python -m vinemap.tune CLOUD``.
 
 Every model is held against the foliage's outlines in fine, fixed sections (V_ref of Table 3.1): between its own
-sections its mesh runs straight, so that sections far apart are paid for. R depends on the cloud's density alone, and
-Q compares models of one cloud only.
+sections its mesh runs straight, so that sections far apart are paid for. R
+follows the cloud's density, so that Q compares models of one cloud only.
 """
 
 from __future__ import annotations
@@ -59,8 +59,12 @@ class Score(NamedTuple):
     @property
     def quality(self) -> Values:
         """Q (n,) of Eq. 23, with the mean of R."""
-        mean = self.reduction.mean() if len(self.reduction) else 0.0
-        return self.good - (self.under + self.over) + mean
+        return self.good - (self.under + self.over) + mean(self.reduction)
+
+
+def mean(values: Values) -> float:
+    """Mean, 0 of nothing."""
+    return float(values.mean()) if len(values) else 0.0
 
 
 def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b: float, c: int, foot: str) -> Score:
@@ -107,9 +111,10 @@ def reference_model(points: PointCloud, found: RowMap) -> CanopyModel:
     return _model(points, found, REFERENCE, OUTLINE, "foliage")
 
 
-def search(points: PointCloud, found: RowMap, *, seed: int = 0, generations: int = 12) -> tuple[float, float, int]:
+def search(
+    points: PointCloud, found: RowMap, reference: CanopyModel, *, seed: int = 0, generations: int = GENERATIONS
+) -> tuple[float, float, int]:
     """The [a, b, c] of the highest mean Q within the thesis's ranges, to the centimetre, by differential evolution."""
-    reference = reference_model(points, found)
 
     def rounded(x: Values) -> tuple[float, float, int]:
         return round(float(x[0]), 2), round(float(x[1]), 2), round(float(x[2]))
@@ -151,22 +156,33 @@ def draw(scores: dict[str, Score], path: Path) -> None:
 @click.option("--parcel", help="Name of the polygon, where the file has several.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none.")
 @click.option("--length", default=LENGTH, show_default=True, help="Metres of rows to search with.")
+@click.option("--generations", default=GENERATIONS, show_default=True, help="Of the search.")
 @click.option("--out", type=FILE, default=Path("build/tune.png"), show_default=True, help="Picture to draw.")
-def main(cloud: Path, boundary: Path | None, parcel: str | None, crs: str | None, length: float, out: Path) -> None:
+def main(
+    cloud: Path,
+    boundary: Path | None,
+    parcel: str | None,
+    crs: str | None,
+    length: float,
+    generations: int,
+    out: Path,
+) -> None:
     """Search the [a, b, c] that models the canopies in CLOUD best."""
     polygon = read_boundary(boundary, parcel=parcel) if boundary else None
     points = read_cloud(cloud, crs=parse_crs(crs) if crs else None, boundary=polygon)
     found = some_rows(map_rows(points, Settings()), length)
     if len(found.rows) == 0:
         raise InputError(f"{cloud}: no vine row found, so that there is no canopy to model")
-    best = search(points, found, generations=GENERATIONS)
     reference = reference_model(points, found)
+    if len(reference.table) == 0:
+        raise InputError(f"{cloud}: has too few points for sections of its canopies")
+    best = search(points, found, reference, generations=generations)
     models = {"best": (*best, "foliage"), "the thesis's": (*THESIS, "foliage"), "on the soil": (*THESIS, "soil")}
     scores = {}
     for name, (a, b, c, foot) in models.items():
         scores[f"{name} [{a:g}, {b:g}, {c}]"] = score(points, found, reference, a, b, c, foot)
     for name, one in scores.items():
-        good, under, over, reduction = (np.mean(v) for v in (one.good, one.under, one.over, one.reduction))
+        good, under, over, reduction = (mean(v) for v in (one.good, one.under, one.over, one.reduction))
         click.echo(
             f"{name}: G {good:.3f}, U {under:.3f}, O {over:.3f}, R {reduction:.3f}, "
             f"Q {one.quality.mean():.3f} ± {one.quality.std():.3f}"
