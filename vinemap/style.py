@@ -21,6 +21,14 @@ WORDS = {
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
     "rows_length_m": "Length of all rows (m)",
+    "bottom_m": "Bottom of the foliage (m)",
+    "trv_m3_ha": "Tree-row volume (m³/ha)",
+    "lwa_m2_ha": "Leaf-wall area (m²/ha)",
+    "good": "Good modelling",
+    "under": "Under-modelling",
+    "over": "Over-modelling",
+    "reduction": "Complexity reduction",
+    "quality": "Quality score",
 }
 SYMBOLS = {
     "rows": ("line", "SimpleLine", {"line_color": "26,122,58,255", "line_width": "0.6", "capstyle": "round"}),
