@@ -73,9 +73,10 @@ def test_points_go_to_the_nearest_row():
     lines = [np.array([[0, 0], [10.0, 0]]), np.array([[0, 2.0], [10.0, 2.0]])]
     xyz = np.random.default_rng(0).uniform([0, -1, 0], [10, 3, 2], (8000, 3))
     sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame(lines, 3.0), gaps_frame(), flat(-5, -5))
-    y = sections.points[:, 0] + sections.origin[sections.section, 1]
-    assert (y[sections.row_id[sections.section] == 1] <= 1.13).all()
-    assert (y[sections.row_id[sections.section] == 2] >= 0.87).all()
+    n = np.diff(sections.start)
+    y, row = sections.points[:, 0] + np.repeat(sections.origin[:, 1], n), np.repeat(sections.row_id, n)
+    assert (y[row == 1] <= 1.13).all()
+    assert (y[row == 2] >= 0.87).all()
 
 
 @pytest.mark.parametrize(("per_metre", "width"), [(200, 0.4), (75, 0.6), (5, 1.0)])

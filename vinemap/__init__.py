@@ -2,7 +2,7 @@
 
 Modules import in one direction only::
 
-    errors, crs <- cloud, raster, vector, mesh <- stages <- parcel <- cli, flows
+    errors, crs, compiled <- cloud, raster, vector, mesh <- stages <- parcel <- cli, flows
 
 The stages are ``ground``, ``row_field``, ``key_points``, ``clustering``, ``curves`` (rows) and
 ``sections``, ``canopy``, ``cgon`` (meshes). No stage opens a file; no stage imports another.

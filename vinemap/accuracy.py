@@ -22,7 +22,7 @@ from vinemap.cloud import PointCloud
 from vinemap.config import PolygonOptions, Settings
 from vinemap.evaluate import evaluate_rows
 from vinemap.parcel import RowMap, map_rows, model_canopies
-from vinemap.raster import Raster, RowField, cell_of, sample
+from vinemap.raster import Raster, RowField, cell_of, sample, sample_across
 from vinemap.scenes import FAMILIES, family
 
 if TYPE_CHECKING:
@@ -334,7 +334,7 @@ def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: Row
     here, ahead = (shapely.get_coordinates(shapely.line_interpolate_point(axis, s + step)) for step in (0, 0.05))
     way = np.where(np.arange(len(s))[:, None] < len(s) - 1, ahead - here, (ahead - here)[-2])
     normal = np.column_stack([-way[:, 1], way[:, 0]]) / np.hypot(*way.T)[:, None]
-    image = sample(found.cover, here[:, None] + left[:, None] * normal[:, None])
+    image = sample_across(found.cover, here, normal, left)
     extent = (-reach, axis.length - reach, -reach, reach)
     axes.imshow(image.T[::-1], extent=extent, aspect="auto", cmap="Greys", vmin=0, vmax=1)
     for rows, colour in ((survey.rows, "tab:green"), (found.rows, "red")):

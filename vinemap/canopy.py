@@ -208,9 +208,8 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     levels = _pooled(_histograms(canopy.points[:, 1], canopy.start, 0.0, FOOT_BIN, round(3 / FOOT_BIN)), near)
     low, high = (_rank(levels, q) * FOOT_BIN for q in FOOT_RANKS)
     foot = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
-    canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)), np.ones(m, dtype=bool))
-    near_foot: Flags = canopy.points[:, 1] <= np.repeat(foot, np.diff(canopy.start)) + FOOT_BAND
-    band = canopy.subset(near_foot, np.ones(m, dtype=bool))
+    canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
+    band = canopy.subset(canopy.points[:, 1] <= np.repeat(foot, np.diff(canopy.start)) + FOOT_BAND)
     widths = _pooled(_histograms(band.points[:, 0], band.start, -1.0, FOOT_BIN, round(2 / FOOT_BIN)), near)
     right, left = (_rank(widths, q) * FOOT_BIN - 1.0 for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
     feet = np.stack([(left + right) / 2, foot, left, foot, right, foot], axis=-1).reshape(m, 3, 2)

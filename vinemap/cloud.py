@@ -68,13 +68,9 @@ class Sections(NamedTuple):
     member: NDArray[np.int64]
     """Index (n,) of each point in the cloud; it climbs within a section."""
 
-    @property
-    def section(self) -> NDArray[np.int64]:
-        """Section (n,) of each point."""
-        return np.repeat(np.arange(len(self.row_id)), np.diff(self.start))
-
-    def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_]) -> Sections:
-        """The points (n,) and sections (m,) that are flagged; no point of a section that isn't may be."""
+    def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_] | None = None) -> Sections:
+        """The points (n,) and sections (m,; by default all) that are flagged; no point of another section may be."""
+        sections = np.ones(len(self.row_id), dtype=bool) if sections is None else sections
         n = np.zeros(len(sections), dtype=np.int64)
         in_threads(lambda part: _count_flags(*part, points, self.start, n), stretches(len(n)))
         before = np.concatenate([[0], np.cumsum(n)])

@@ -86,7 +86,7 @@ def cluster_rows(
         return out.assign(cluster=pieces)
     ends = _ends(xy[kept], direction[kept], spacing[kept], pieces, graph[kept][:, kept])
     pairs = _candidates(ends, max_gap)
-    pairs = pairs[~_across_track(ends, pairs, xy[kept], track_width)]
+    pairs = pairs[~_over_track_or_headland(ends, pairs, xy[kept], track_width)]
     return out.assign(cluster=_join(pairs, len(ends.spacing))[pieces])
 
 
@@ -267,7 +267,7 @@ def _kinked(ends: _Ends, a: Labels, b: Labels, length: Values) -> NDArray[np.boo
     return out
 
 
-def _across_track(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
+def _over_track_or_headland(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
     """Whether the gap between two ends (k, 2) goes on through the neighbouring rows, three on each side.
 
     It is a track if most of them stand before it and after it, and three in four of those are empty beside it. It is

@@ -246,10 +246,14 @@ def model_canopies(
     points: PointCloud, found: RowMap, settings: Settings, *, step: Callable[..., Any] = call
 ) -> CanopyModel:
     """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
-    options = settings.sections.model_dump()
-    sections = step("Sections", cut_sections, points, found.heights, found.rows, found.gaps, found.dtm, **options)
+    arguments = points, found.heights, found.rows, found.gaps, found.dtm
+    sections = step("Sections", cut_sections, *arguments, **_section_options(settings))
     model: CanopyModel = step("Canopy", model_sections, sections, settings, points.crs)
     return model
+
+
+def _section_options(settings: Settings) -> dict[str, Any]:
+    return settings.sections.model_dump() | {"low": settings.cover.low, "high": settings.cover.high}
 
 
 def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyModel:
@@ -257,7 +261,7 @@ def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyMo
     leaves, soil = separate_canopy(sections, **settings.canopy.model_dump())
     canopy, feet = find_feet(leaves)
     peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
-    canopy = canopy.subset(peeled.kept, np.ones(len(feet), dtype=bool))
+    canopy = canopy.subset(peeled.kept)
     reach = foliage_reach(canopy, peeled.area, peeled.perimeter, peeled.vertices)
     outline, start, grown = grow(canopy.points, canopy.start, feet, reach)
     on_foliage = settings.polygon.foot == "foliage"
@@ -277,7 +281,7 @@ def _all_leaves(leaves: Sections, points: PointCloud, found: RowMap, settings: S
     options = settings.sections
     if options.step <= options.width:
         return leaves
-    dense = options.model_copy(update={"step": options.width}).model_dump()
+    dense = _section_options(settings) | {"step": options.width}
     sections = cut_sections(points, found.heights, found.rows, found.gaps, found.dtm, **dense)
     return separate_canopy(sections, **settings.canopy.model_dump())[0]
 

@@ -143,8 +143,7 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     """Give rows the means of their sections, and their foliage's ``volume_m3``; NaN where there is none.
 
     The means are ``height_m``, ``width_m``, ``bottom_m``, ``trv_m3_ha`` and ``lwa_m2_ha``. The volume is that of the
-    foliage's outlines, each reaching half way to its neighbours, or half a ``step``
-    into a gap.
+    foliage's outlines, each reaching half way to its neighbours, or half a ``step`` into a gap.
     """
     groups = sections.groupby("row_id")
     names = ["height_m", "width_m", "bottom_m", "trv_m3_ha", "lwa_m2_ha"]

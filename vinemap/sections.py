@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     Values = NDArray[np.floating]
 
 
-CANOPY, HALF = 0.5, 0.9
-"""Metres above ground, and to both sides of a row, within which points are taken for canopy."""
+HALF = 0.9
+"""Metres to both sides of a row within which points are taken for canopy."""
 
 
 def cut_sections(
@@ -37,6 +37,8 @@ def cut_sections(
     step: float = 0.25,
     min_points: int = 45,
     max_width: float = 1.0,
+    low: float = 0.5,
+    high: float = 2.9,
 ) -> Sections:
     """Cut sections along every row, except where it has no canopy (Eq. 2–3).
 
@@ -55,7 +57,9 @@ def cut_sections(
     width, step : float
         Extent a of a section along γ, and distance b of sections along γ, in metres.
     min_points, max_width : int, float
-        Points above ``CANOPY`` that sections of a row are widened for, and metres to which they may be.
+        Points of canopy that sections of a row are widened for, and metres to which they may be.
+    low, high : float
+        Heights in metres between which points count as canopy.
     """
     if len(rows) == 0:
         none = np.empty(0)
@@ -73,7 +77,8 @@ def cut_sections(
 
     def find(k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         mine = slice(near.start[k], near.start[k + 1])
-        canopy = (heights[near.member[mine]] > CANOPY) & (np.abs(near.left[mine]) < HALF)
+        height = heights[near.member[mine]]
+        canopy = (height >= low) & (height <= high) & (np.abs(near.left[mine]) < HALF)
         per_metre = max(float(canopy.sum()), 1.0) / max(len(parts[k]) * step, step)
         a = max(width, min(max_width, min_points / per_metre))
         return _members(near.along[mine], parts[k], a / 2)

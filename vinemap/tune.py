@@ -1,8 +1,8 @@
 """Search of a model's [a, b, c] by its quality score, as in section 3.3: ``python -m vinemap.tune CLOUD``.
 
 Every model is held against the foliage's outlines in fine, fixed sections (V_ref of Table 3.1): between its own
-sections its mesh runs straight, so that sections far apart are paid for. R
-follows the cloud's density, so that Q compares models of one cloud only.
+sections its mesh runs straight, so that sections far apart are paid for. R follows the cloud's density, so that Q
+compares models of one cloud only.
 """
 
 from __future__ import annotations
