@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from vinemap.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
-from vinemap.cloud import PointCloud, write_classified
+from vinemap.cloud import PointCloud
 from vinemap.config import Settings
+from vinemap.las import write_classified
 from vinemap.parcel import map_rows, model_canopies
 
 
@@ -17,8 +18,8 @@ def classified(cloud):
     flyers = middle + np.column_stack([np.linspace(-9, 9, 10), np.linspace(9, -9, 10), np.full(10, 12.0)])
     flown = PointCloud(np.concatenate([cloud.xyz, flyers]), cloud.crs)
     found = map_rows(flown, Settings())
-    leaves = model_canopies(flown, found, Settings()).leaves
-    return flown, found, *classify_points(flown, found.heights, leaves)
+    leaves = model_canopies(found, Settings()).leaves
+    return flown, found, *classify_points(found.cloud, leaves)
 
 
 def test_ground_canopy_and_noise(classified, vineyard):
@@ -51,8 +52,8 @@ def test_canopy_knows_its_row(classified, vineyard):
 def test_a_cloud_without_canopy(cloud):
     flat = PointCloud(cloud.xyz[:1000] * [1, 1, 0], cloud.crs)
     found = map_rows(flat, Settings())
-    leaves = model_canopies(flat, found, Settings()).leaves
-    classes, row_id = classify_points(flat, found.heights, leaves)
+    leaves = model_canopies(found, Settings()).leaves
+    classes, row_id = classify_points(found.cloud, leaves)
     assert (classes == GROUND).all()
     assert (row_id == 0).all()
 
@@ -60,10 +61,10 @@ def test_a_cloud_without_canopy(cloud):
 def test_file_read_back(classified, tmp_path):
     flown, found, classes, row_id = classified
     path = tmp_path / "classified.laz"
-    write_classified(flown, found.heights, classes, row_id, path)
+    write_classified(found.cloud, classes, row_id, path)
     back = laspy.read(path)
     assert np.abs(back.xyz - flown.xyz).max() < 0.001
     assert (np.asarray(back.classification) == classes).all()
     assert (np.asarray(back["row_id"]) == row_id).all()
-    assert np.abs(np.asarray(back["HeightAboveGround"]) - found.heights).max() < 1e-4
+    assert np.abs(np.asarray(back["HeightAboveGround"]) - found.cloud.heights).max() < 1e-4
     assert back.header.parse_crs().to_epsg() == 32632

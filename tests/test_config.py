@@ -101,10 +101,11 @@ def test_defaults_of_settings_are_those_of_the_stages():
         "curves": curves.trace_rows,
         "fit": row_fit.fit_rows,
         "sections": sections.cut_sections,
-        "canopy": canopy.separate_canopy,
+        "canopy": [canopy.separate_canopy, canopy.living_canopies],
     }
     for name, options in Settings().model_dump().items():
         if name in stages:
-            parameters = inspect.signature(stages[name]).parameters.values()
+            functions = stages[name] if isinstance(stages[name], list) else [stages[name]]
+            parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
             defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
             assert defaults == options | {k: Settings().cover.model_dump()[k] for k in defaults if k not in options}

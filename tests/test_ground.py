@@ -5,7 +5,7 @@ import pytest
 
 from vinemap.cloud import PointCloud
 from vinemap.crs import parse_crs
-from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
+from vinemap.ground import canopy_height_model, terrain_model
 from vinemap.raster import sample
 from vinemap.scenes import hillside, rows_of, terraced
 from vinemap.synthetic import Obstacle, Vineyard, simulate
@@ -81,10 +81,10 @@ def test_closed_canopy():
 
 def test_heights_and_canopy_height_model(vineyard, cloud):
     dtm = terrain_model(cloud)
-    heights = height_above_ground(cloud, dtm)
+    above = cloud.above(dtm)
     truth = cloud.xyz[:, 2] - vineyard.terrain(cloud.xyz[:, 0], cloud.xyz[:, 1])
-    assert np.median(np.abs(heights - truth)) < 0.02
-    chm = canopy_height_model(cloud, heights)
+    assert np.median(np.abs(above.heights - truth)) < 0.02
+    chm = canopy_height_model(above)
     assert np.nanquantile(chm.values, 0.99) == pytest.approx(vineyard.rows["mean_height"].mean(), abs=0.3)
     assert np.nanmin(chm.values) == 0
 

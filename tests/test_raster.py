@@ -6,14 +6,14 @@ import rasterio
 from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.raster import Grid, Raster, cell_of, coarser, grid_over, sample, write_cog
+from vinemap.raster import Grid, Raster, cell_of, coarser, extent, grid_over, sample, write_cog
 
 UTM = CRS.from_epsg(32632)
 
 
 def test_grid_holds_its_points():
     xy = np.random.default_rng(0).uniform([1000.3, 2000.7], [1010.9, 2005.2], (500, 2))
-    grid = grid_over(xy, resolution=0.5)
+    grid = grid_over(*extent(xy), resolution=0.5)
     cells = cell_of(xy, grid)
     assert cells.max() < grid.ny * grid.nx
     x, y = grid.centres()
@@ -23,12 +23,12 @@ def test_grid_holds_its_points():
 
 
 def test_grid_of_a_single_point():
-    assert grid_over(np.array([[5.0, 7.0]]), resolution=0.25).shape == (1, 1)
+    assert grid_over([5.0, 7.0], [5.0, 7.0], resolution=0.25).shape == (1, 1)
 
 
 def test_too_large_a_grid_says_what_to_do():
     with pytest.raises(InputError, match="--boundary"):
-        grid_over(np.array([[0.0, 0.0], [1e5, 1e5]]), resolution=0.1)
+        grid_over([0.0, 0.0], [1e5, 1e5], resolution=0.1)
 
 
 def test_coarser_grid_covers_the_same_area():

@@ -1,5 +1,7 @@
 """Row field against waves and vineyards of known direction and spacing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pyproj import CRS
@@ -7,7 +9,7 @@ from pyproj import CRS
 from vinemap.cloud import PointCloud
 from vinemap.cover import canopy_cover
 from vinemap.crs import parse_crs
-from vinemap.ground import height_above_ground, terrain_model
+from vinemap.ground import terrain_model
 from vinemap.raster import Grid, Raster, grid_over
 from vinemap.row_field import estimate_row_field
 from vinemap.scenes import hillside, rows_of
@@ -62,7 +64,7 @@ def test_curved_rows_on_a_slope():
     rows = rows_of(10, length=60, radius=40)
     survey = simulate([Vineyard("A", rows, dead=0.1)], hillside(0.2), seed=5)
     cloud = PointCloud(survey.xyz, parse_crs("EPSG:32632"))
-    cover = canopy_cover(cloud, height_above_ground(cloud, terrain_model(cloud)))
+    cover = canopy_cover(cloud.above(terrain_model(cloud)))
     field = estimate_row_field(cover)
     truth, places = [], []
     for row in rows[1:-1]:
@@ -80,17 +82,17 @@ def test_curved_rows_on_a_slope():
 
 
 def test_cover_does_not_follow_density_and_leaves_trees_out(vineyard, cloud):
-    heights = height_above_ground(cloud, terrain_model(cloud))
-    half = np.random.default_rng(0).random(len(heights)) < 0.5
-    dense = canopy_cover(cloud, heights, smoothing=0.2)
-    sparse = canopy_cover(PointCloud(cloud.xyz[half], cloud.crs), heights[half], smoothing=0.2)
+    cloud = cloud.above(terrain_model(cloud))
+    half = np.random.default_rng(0).random(cloud.size) < 0.5
+    dense = canopy_cover(cloud, smoothing=0.2)
+    sparse = canopy_cover(replace(cloud, xyz=cloud.xyz[half], heights=cloud.heights[half]), smoothing=0.2)
     assert np.abs(dense.values.mean() - sparse.values.mean()) < 0.05 * dense.values.mean()
 
     rows = rows_of(1, length=20)
     x, y = rows[0].mean(axis=0) + [0, 6]
     survey = simulate([Vineyard("A", rows)], hillside(0.1), obstacles=[Obstacle(x, y, 2.0, 2.0, 6.0, 1.0)], seed=1)
     tree = PointCloud(survey.xyz, cloud.crs)
-    cover = canopy_cover(tree, height_above_ground(tree, terrain_model(tree)))
-    grid = grid_over(tree.xyz, resolution=0.1)
+    cover = canopy_cover(tree.above(terrain_model(tree)))
+    grid = grid_over(*tree.extent, resolution=0.1)
     gx, gy = np.meshgrid(*grid.centres())
     assert cover.values[np.hypot(gx - x, gy - y) < 1.5].max() < 0.05

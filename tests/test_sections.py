@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from vinemap.canopy import find_feet, foliage_reach, separate_canopy
+from vinemap.canopy import find_feet, foliage_reach, living_canopies, separate_canopy
 from vinemap.cgon import peel_sections
-from vinemap.cloud import PointCloud, Sections
+from vinemap.cloud import PointCloud, Sections, join
 from vinemap.config import Settings
-from vinemap.ground import height_above_ground, terrain_model
+from vinemap.ground import terrain_model
 from vinemap.parcel import model_sections
 from vinemap.raster import Grid, Raster
 from vinemap.section_table import complexity_reduction, measure_sections, modelling_indices, quantile_of, summarise_rows
@@ -34,6 +34,16 @@ def gaps_frame(*gaps):
     return gpd.GeoDataFrame(columns, geometry=[None] * len(gaps), crs=UTM)
 
 
+def cut(xyz, rows, gaps, dtm, **options):
+    """Sections of a cloud whose heights are its z."""
+    return join(cut_sections(PointCloud(xyz, UTM, heights=xyz[:, 2]), rows, gaps, dtm, lambda s: s, **options))
+
+
+def separate(sections):
+    """Canopy points of sections, and the thesis's feet."""
+    return living_canopies([separate_canopy(sections)])
+
+
 def flat(west, south, size=60.0, level=0.0):
     return Raster(np.full((2, 2), level), Grid(west, south + size, size / 2, 2, 2), UTM)
 
@@ -44,7 +54,7 @@ def test_every_section_holds_the_points_around_its_station():
     line = np.column_stack([30 * np.sin(t), 30 - 30 * np.cos(t)])
     xyz = np.column_stack([rng.uniform(-3, 30, 40000), rng.uniform(-3, 20, 40000), rng.uniform(0, 2, 40000)])
     rows = rows_frame([line])
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5), min_points=0)
+    sections = cut(xyz, rows, gaps_frame(), flat(-5, -5), min_points=0)
     length = rows.length.iloc[0]
     assert len(sections.row_id) == round(length / 0.25) + 1
     assert sections.position[[0, -1]] == pytest.approx([0, length])
@@ -62,9 +72,7 @@ def test_every_section_holds_the_points_around_its_station():
 def test_sections_leave_gaps_out():
     line = np.array([[0, 0], [20.0, 0]])
     xyz = np.random.default_rng(0).uniform([-1, -1, 0], [21, 1, 2], (5000, 3))
-    sections = cut_sections(
-        PointCloud(xyz, UTM), xyz[:, 2], rows_frame([line]), gaps_frame((1, 5.0, 9.0)), flat(-5, -5)
-    )
+    sections = cut(xyz, rows_frame([line]), gaps_frame((1, 5.0, 9.0)), flat(-5, -5))
     assert not ((sections.position > 5) & (sections.position < 9)).any()
     assert sections.position.max() == 20
 
@@ -72,7 +80,7 @@ def test_sections_leave_gaps_out():
 def test_points_go_to_the_nearest_row():
     lines = [np.array([[0, 0], [10.0, 0]]), np.array([[0, 2.0], [10.0, 2.0]])]
     xyz = np.random.default_rng(0).uniform([0, -1, 0], [10, 3, 2], (8000, 3))
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame(lines, 3.0), gaps_frame(), flat(-5, -5))
+    sections = cut(xyz, rows_frame(lines, 3.0), gaps_frame(), flat(-5, -5))
     n = np.diff(sections.start)
     y, row = sections.points[:, 0] + np.repeat(sections.origin[:, 1], n), np.repeat(sections.row_id, n)
     assert (y[row == 1] <= 1.13).all()
@@ -85,15 +93,16 @@ def test_sections_are_wider_where_points_are_few(per_metre, width):
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(0, 20, n), rng.uniform(-0.5, 0.5, n), rng.uniform(1, 2, n)])
     rows = rows_frame([np.array([[0, 0], [20.0, 0]])])
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5))
+    sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
     inner = (sections.position > 1) & (sections.position < 19)
     assert np.diff(sections.start)[inner].mean() == pytest.approx(per_metre * width, rel=0.15)
 
 
 def test_no_rows_no_sections():
     xyz = np.zeros((5, 3))
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows_frame([]), gaps_frame(), flat(-5, -5))
-    canopy, feet = find_feet(separate_canopy(sections)[0])
+    cloud = PointCloud(xyz, UTM, heights=xyz[:, 2])
+    canopies = cut_sections(cloud, rows_frame([]), gaps_frame(), flat(-5, -5), separate_canopy)
+    canopy, feet = find_feet(living_canopies(canopies)[0])
     none = np.empty(0)
     table = measure_sections(canopy, none, np.empty((0, 7, 2)), none, (none, none, none), crs=UTM)
     assert len(table) == len(feet) == 0
@@ -102,10 +111,8 @@ def test_no_rows_no_sections():
 
 def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     dtm = terrain_model(cloud)
-    heights = height_above_ground(cloud, dtm)
     truth = vineyard.rows.assign(row_id=vineyard.rows["row"], spacing_m=2.5)
-    sections = cut_sections(cloud, heights, truth, gaps_frame(), dtm)
-    canopy, soil = separate_canopy(sections)
+    canopy, soil = living_canopies(cut_sections(cloud.above(dtm), truth, gaps_frame(), dtm, separate_canopy))
     # Sections where vines are dead fall away, those of living vines stay.
     dead = vineyard.dead_vines
     dead = dead[dead.groupby("row")["vine"].transform("size") >= 3]
@@ -153,7 +160,7 @@ def test_soil_noise_on_flat_ground_is_no_canopy():
     rng = np.random.default_rng(0)
     soil = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.normal(0, 0.03, 200)])
     leaves = np.column_stack([rng.normal(0, 0.2, 100), rng.uniform(0.6, 1.9, 100)])
-    canopy, _ = separate_canopy(one_section(np.concatenate([soil, leaves])))
+    canopy, _ = separate(one_section(np.concatenate([soil, leaves])))
     assert len(canopy.points) > 90
     assert canopy.points[:, 1].min() > 0.5
 
@@ -162,7 +169,7 @@ def test_flyers_are_no_canopy():
     rng = np.random.default_rng(0)
     leaves = np.column_stack([rng.normal(0, 0.15, 150), rng.uniform(0.6, 1.9, 150)])
     flyers = np.array([[0.85, 1.5], [-0.8, 2.6], [0.7, 2.2]])
-    canopy, _ = separate_canopy(one_section(np.concatenate([leaves, flyers])))
+    canopy, _ = separate(one_section(np.concatenate([leaves, flyers])))
     assert np.abs(canopy.points[:, 0]).max() < 0.6
     assert canopy.points[:, 1].max() < 2.0
 
@@ -264,7 +271,7 @@ points_of = st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-0.3, 3)), max_si
 def test_any_sections_give_a_defined_model(sections):
     """Sections without points, with three, on a line, of one point many times, of one side only."""
     points = [np.array(p, dtype=float).reshape(-1, 2) for p in sections]
-    model = model_sections(many_sections(points), Settings(), UTM)
+    model = model_sections(*separate(many_sections(points)), Settings(), UTM)
     assert len(model.polygons) == len(model.table) == len(model.canopy.row_id)
     assert np.isfinite(model.polygons).all()
     assert np.isfinite(model.table.drop(columns="geometry").to_numpy()).all()
@@ -275,7 +282,7 @@ def test_any_sections_give_a_defined_model(sections):
 def test_a_million_points_in_a_section():
     rng = np.random.default_rng(0)
     crowd = np.column_stack([rng.normal(0, 0.15, 1_000_000), rng.uniform(0.5, 2, 1_000_000)])
-    model = model_sections(many_sections([crowd, crowd[:200]]), Settings(), UTM)
+    model = model_sections(*separate(many_sections([crowd, crowd[:200]])), Settings(), UTM)
     assert model.table["n_points"].max() > 900_000
     assert model.table["height_m"].iloc[0] == pytest.approx(1.98, abs=0.01)
 
@@ -283,7 +290,7 @@ def test_a_million_points_in_a_section():
 def test_a_row_shorter_than_a_step():
     xyz = np.column_stack([np.random.default_rng(0).uniform([0, -0.2, 0.5], [0.1, 0.2, 2], (500, 3))])
     rows = rows_frame([np.array([[0, 0], [0.1, 0]])])
-    sections = cut_sections(PointCloud(xyz, UTM), xyz[:, 2], rows, gaps_frame(), flat(-5, -5))
-    model = model_sections(sections, Settings(), UTM)
+    sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
+    model = model_sections(*separate(sections), Settings(), UTM)
     assert len(model.table) == 2
     assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1

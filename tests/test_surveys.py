@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 
 from vinemap import paths
 from vinemap.canopy import section_meshes
-from vinemap.cloud import PointCloud, read_cloud
+from vinemap.cloud import PointCloud
 from vinemap.config import Settings
 from vinemap.crs import Origin
 from vinemap.evaluate import evaluate_rows
-from vinemap.ground import height_above_ground, terrain_model
+from vinemap.ground import terrain_model
+from vinemap.las import read_cloud
 from vinemap.mesh import volume
 from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
 from vinemap.section_table import modelling_indices, summarise_rows
@@ -71,7 +72,7 @@ def modelled(shared):
         chosen = np.random.default_rng(0).random(len(points.xyz)) < share
         points = PointCloud(points.xyz[chosen], points.crs)
         found = map_rows(points, Settings())
-        return found, model_canopies(points, found, Settings())
+        return found, model_canopies(found, Settings())
 
     return modelled
 
@@ -118,8 +119,8 @@ def test_the_real_row(shared):
     line = shapely.LineString([(0, middle, 0), (1.9, middle, 0)])
     rows = gpd.GeoDataFrame({"row_id": [1], "label": ["1"], "spacing_m": [2.5]}, geometry=[line], crs=points.crs)
     none = gpd.GeoDataFrame({key: np.empty(0) for key in ("row_id", "start_m", "end_m")}, geometry=[], crs=points.crs)
-    found = RowMap(dtm, height_above_ground(points, dtm), None, None, 0, rows, none)
-    model = model_canopies(points, found, Settings())
+    found = RowMap(points.above(dtm), dtm, None, None, None, 0, rows, none)
+    model = model_canopies(found, Settings())
     rows = summarise_rows(rows, model.table, step=0.25)
     assert len(model.table) == 9
     assert rows["height_m"].iloc[0] == pytest.approx(1.5, abs=0.15)

@@ -23,28 +23,28 @@ def test_the_longest_rows_are_enough(cloud, found):
 
 
 def test_better_models_score_higher(cloud, found):
-    reference = reference_model(cloud, found)
-    fine = score(cloud, found, reference, 0.4, 0.25, 7, "foliage")
+    reference = reference_model(found)
+    fine = score(found, reference, 0.4, 0.25, 7, "foliage")
     assert fine.good.mean() > 0.93
     assert fine.over.mean() < 0.09
     assert 0.8 < fine.quality.mean() < 1
     # Feet on the soil take in the void; sections far apart cut across bends and gaps.
-    assert score(cloud, found, reference, 0.4, 0.25, 7, "soil").over.mean() > fine.over.mean() + 0.2
-    coarse = score(cloud, found, reference, 0.4, 2.0, 7, "foliage")
+    assert score(found, reference, 0.4, 0.25, 7, "soil").over.mean() > fine.over.mean() + 0.2
+    coarse = score(found, reference, 0.4, 2.0, 7, "foliage")
     assert coarse.good.mean() - coarse.over.mean() < fine.good.mean() - fine.over.mean() - 0.02
     # More vertices fit more closely and weigh more.
-    rich = score(cloud, found, reference, 0.4, 0.25, 11, "foliage")
+    rich = score(found, reference, 0.4, 0.25, 11, "foliage")
     assert rich.over.mean() < fine.over.mean()
     assert rich.reduction.mean() < fine.reduction.mean()
 
 
 def test_search_keeps_to_its_ranges_and_finds_no_worse_than_it_began(cloud, found):
-    reference = reference_model(cloud, found)
-    best = search(cloud, found, reference, generations=1)
+    reference = reference_model(found)
+    best = search(found, reference, generations=1)
     for value, (low, high) in zip(best, BOUNDS, strict=True):
         assert low <= value <= high
     assert isinstance(best[2], int)
-    ours, thesis = (score(cloud, found, reference, *model, "foliage") for model in (best, (0.4, 0.25, 7)))
+    ours, thesis = (score(found, reference, *model, "foliage") for model in (best, (0.4, 0.25, 7)))
     assert ours.quality.mean() >= thesis.quality.mean() - 0.01
 
 

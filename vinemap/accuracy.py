@@ -281,7 +281,7 @@ def measure(name: str, seeds: int, out: Path | None = None) -> tuple[Errors, Can
         points = PointCloud(survey.xyz, survey.rows.crs)
         found = map_rows(points, ours)
         errors, worst = compare(survey, found)
-        model, on_soil = (model_canopies(points, found, settings) for settings in (ours, thesis))
+        model, on_soil = (model_canopies(found, settings) for settings in (ours, thesis))
         canopies.append(compare_canopies(survey, found, model, on_soil, errors.pairs, step=ours.sections.step))
         cases.append((errors, worst, survey, found, f"{name}, seed {seed}"))
     if out:

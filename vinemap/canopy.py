@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vinemap.cloud import NO_SECTIONS, join
 from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.mesh import Mesh, loft, merge
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -38,6 +41,16 @@ FOOT_BAND, FOOT_SPREAD = 0.15, 0.8
 """Metres above the foot whose points tell how wide the canopy stands on it, and the quantile that is its side."""
 
 
+class Canopy(NamedTuple):
+    """Canopy points of m sections, whether they are enough or not."""
+
+    sections: Sections
+    soil: Values
+    """The thesis's fixed vertices (m, 3, 2) of the c-gon: v1 on γ, v2 and vc under both walls at the inter-row."""
+    tall: Values
+    """Share (m,) of a section's points that are high."""
+
+
 def separate_canopy(
     sections: Sections,
     *,
@@ -45,11 +58,9 @@ def separate_canopy(
     half_width: float = 0.9,
     max_height: float = 2.9,
     min_neighbours: float = 0.02,
-    min_points: int = 8,
-    min_share: float = 0.15,
     min_height: float = 0.8,
-) -> tuple[Sections, Values]:
-    """Keep the canopy's points, and the sections that have a canopy.
+) -> Canopy:
+    """Keep the canopy's points of sections.
 
     On each side of γ a plane runs from the foot of the vines to the canopy's wall at the elevation of the inter-row
     (Eq. 4–10). A point is canopy if it lies ``margin`` above that plane, where the printed plane cuts through the
@@ -64,31 +75,53 @@ def separate_canopy(
         which it ends.
     min_neighbours : float
         Share of a section's canopy points that must lie around a point (in 3 x 3 cells of 0.1 m), or it is noise.
+    min_height : float
+        Metres from which points are high.
+    """
+    m = len(sections.row_id)
+    keep = np.zeros(len(sections.points), dtype=bool)
+    walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
+    limits = (margin, half_width, max_height, min_neighbours, min_height)
+    in_threads(
+        lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, tall),
+        stretches(m),
+    )
+    soil = np.concatenate([np.zeros((m, 1, 2)), walls * np.array([[1.0, 1.0], [-1.0, 1.0]])], axis=1)
+    return Canopy(sections.subset(keep), soil, tall)
+
+
+def living_canopies(
+    canopies: Sequence[Canopy], *, min_points: int = 8, min_share: float = 0.15
+) -> tuple[Sections, Values]:
+    """Join the rows' canopies, of those sections that have one.
+
+    Parameters
+    ----------
+    canopies : sequence of Canopy
+        One a row.
     min_points : int
         Points that a section must have.
     min_share : float
         Share of the median section's points that a section must have.
-    min_height : float
-        Metres that the highest tenth of a section must reach.
 
     Returns
     -------
     canopy : Sections
-        Canopy points of the sections that have a canopy.
+        Canopy points of m sections.
     soil : (m, 3, 2) array
-        The thesis's fixed vertices of the c-gon: v1 on γ, v2 and vc under both walls at the inter-row's elevation.
+        The thesis's fixed vertices of their c-gons.
     """
-    m = len(sections.row_id)
-    keep = np.zeros(len(sections.points), dtype=bool)
-    walls, n, tall = np.zeros((m, 2, 2)), np.zeros(m, dtype=np.int64), np.zeros(m)
-    limits = (margin, half_width, max_height, min_neighbours, min_height)
-    in_threads(
-        lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, n, tall),
-        stretches(m),
-    )
-    enough = (n >= max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)) & (tall >= TALL)
-    soil = np.concatenate([np.zeros((m, 1, 2)), walls * np.array([[1.0, 1.0], [-1.0, 1.0]])], axis=1)
-    return sections.subset(keep & np.repeat(enough, np.diff(sections.start)), enough), soil[enough]
+    if not canopies:
+        return NO_SECTIONS, np.empty((0, 3, 2))
+    n = np.concatenate([np.diff(canopy.sections.start) for canopy in canopies])
+    least = max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)
+    kept, soil = [], []
+    for canopy in canopies:
+        own = np.diff(canopy.sections.start)
+        enough = (own >= least) & (canopy.tall >= TALL)
+        kept.append(canopy.sections.subset(np.repeat(enough, own), enough))
+        soil.append(canopy.soil[enough])
+    return join(kept), np.concatenate(soil)
 
 
 @compiled
@@ -101,10 +134,9 @@ def _separate(
     limits: tuple[float, float, float, float, float],
     keep: Flags,
     walls: Values,
-    n: NDArray[np.int64],
     tall: Values,
 ) -> None:
-    """Flag the canopy's points of sections; write wall w and level h of both sides, points, and share of high ones."""
+    """Flag the canopy's points of sections; write wall w and level h of both sides, and the share of high points."""
     margin, half_width, max_height, share, min_height = limits
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
@@ -120,10 +152,11 @@ def _separate(
                 if (y[p] >= 0) == (side == 0):
                     kept[p] = kept[p] and z[p] >= slope * abs(y[p]) + margin
         _drop_noise(y, z, kept, share)
+        n = 0
         for p in range(len(y)):
-            n[k] += kept[p]
+            n += kept[p]
             tall[k] += kept[p] and up[p] >= min_height
-        tall[k] /= max(n[k], 1)
+        tall[k] /= max(n, 1)
 
 
 @compiled

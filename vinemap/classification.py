@@ -21,7 +21,6 @@ COMPANIONS = 3
 
 def classify_points(
     cloud: PointCloud,
-    heights: Values,
     leaves: Sections,
     *,
     ground: float = 0.1,
@@ -33,9 +32,7 @@ def classify_points(
     Parameters
     ----------
     cloud : PointCloud
-        n points.
-    heights : (n,) array
-        Their heights above ground in metres.
+        n points with their heights above ground.
     leaves : Sections
         Canopy points of the rows' sections.
     ground : float
@@ -52,6 +49,7 @@ def classify_points(
     row_id : (n,) array
         Row of the canopy's points, 0 for all others.
     """
+    heights = cloud.heights
     classes = np.full(len(heights), OTHER, dtype=np.uint8)
     classes[np.abs(heights) <= ground] = GROUND
     aloft = np.flatnonzero(np.abs(heights) > air)
@@ -59,8 +57,7 @@ def classify_points(
     canopy[leaves.member] = True
     lone = aloft[~canopy[aloft]]
     if len(lone):
-        west, south = cloud.xyz[:, :2].min(axis=0)
-        east, north = cloud.xyz[:, :2].max(axis=0)
+        (west, south, _), (east, north, _) = cloud.extent
         density = len(heights) / max((east - west) * (north - south), 1.0)
         near = reach * max(1.0, (100 / density) ** 0.5)
         distance, _ = cKDTree(cloud.xyz[aloft]).query(cloud.xyz[lone], COMPANIONS + 1, workers=-1)

@@ -7,6 +7,7 @@ cache doesn't notice changes in another.
 from __future__ import annotations
 
 import os
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
@@ -21,6 +22,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 CORES = os.cpu_count() or 1
+_here = threading.local()
 
 
 def compiled(function: F) -> F:
@@ -32,9 +34,18 @@ def compiled(function: F) -> F:
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """Results of a function for each item, in their order, worked out on all cores where it lets go of the GIL."""
-    with ThreadPoolExecutor(CORES) as pool:
+    """Results of a function for each item, in their order, worked out on all cores where it lets go of the GIL.
+
+    Within one of its own threads it does one after the other.
+    """
+    if getattr(_here, "busy", False):
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(CORES, initializer=_mark_busy) as pool:
         return list(pool.map(function, items))
+
+
+def _mark_busy() -> None:
+    _here.busy = True
 
 
 def stretches(n: int) -> list[tuple[int, int]]:

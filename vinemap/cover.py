@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.compiled import compiled
-from vinemap.raster import Raster, block_sum, cell_of, grid_over
+from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.raster import Raster, block_sum, cell_of, grid_over, window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
+    from vinemap.cloud import Cloud, PointCloud
+    from vinemap.raster import Grid
 
     Values = NDArray[np.floating]
 
@@ -26,8 +27,7 @@ WIDEST = 2.0
 
 
 def canopy_cover(
-    cloud: PointCloud,
-    heights: Values,
+    cloud: Cloud,
     *,
     resolution: float = 0.1,
     low: float = 0.5,
@@ -40,10 +40,8 @@ def canopy_cover(
 
     Parameters
     ----------
-    cloud : PointCloud
-        The parcel's points.
-    heights : (n,) array
-        Their heights above ground in metres.
+    cloud : PointCloud or TiledCloud
+        The parcel's points with their heights above ground.
     resolution : float
         Cell size in metres.
     smoothing : float, optional
@@ -53,27 +51,38 @@ def canopy_cover(
         Heights in metres between which points count as canopy. What is taller (trees, houses) or wider than a row
         of vines (huts, hedges, bushes) is left out.
     """
-    grid = grid_over(cloud.xyz, resolution=resolution)
-    limits = np.array([low, high, TALLEST])
-    counts = _count_layers(cell_of(cloud.xyz, grid), heights, limits, grid.ny * grid.nx).reshape(3, *grid.shape)
+    grid = grid_over(*cloud.extent, resolution=resolution)
+    counts = np.zeros((3, *grid.shape))
+    for part in cloud.parts():
+        around, here = window(grid, *part.extent)
+        counts[:, *here] += _count_layers(part, around, (low, high, TALLEST))
     everything, canopy, tall = counts
-    density = len(heights) / max(1, int(np.count_nonzero(everything)))
+    density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
-    blurred = gaussian_filter(everything, sigma)
-    cover = gaussian_filter(canopy, sigma) / (blurred + 0.1 * density)
+    cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma), [canopy, everything])
+    cover /= blurred + 0.1 * density
     cover[_no_vines(everything, canopy, tall, resolution)] = 0.0
     return Raster(cover, grid, cloud.crs)
 
 
+def _count_layers(cloud: PointCloud, grid: Grid, limits: tuple[float, float, float]) -> NDArray[np.int32]:
+    """Points of each cell (3, ny, nx): all, those between the first two heights, those between the last two."""
+    cells, heights = cell_of(cloud.xyz, grid), cloud.heights
+    counts = in_threads(lambda part: _count(*part, cells, heights, limits, grid.ny * grid.nx), stretches(len(cells)))
+    return np.sum(counts, axis=0, dtype=np.int32).reshape(3, *grid.shape)
+
+
 @compiled
-def _count_layers(cells: NDArray[np.int64], heights: Values, limits: Values, n: int) -> Values:
-    """Points of each cell (3, n): all, those between the first two limits, those between the last two."""
-    counts = np.zeros((3, n))
-    for p in range(len(cells)):
+def _count(
+    first: int, last: int, cells: NDArray[np.int32], heights: Values, limits: tuple[float, float, float], n: int
+) -> NDArray[np.int32]:
+    low, high, highest = limits
+    counts = np.zeros((3, n), dtype=np.int32)
+    for p in range(first, last):
         counts[0, cells[p]] += 1
-        if limits[0] <= heights[p] <= limits[1]:
+        if low <= heights[p] <= high:
             counts[1, cells[p]] += 1
-        elif limits[1] < heights[p] < limits[2]:
+        elif high < heights[p] < highest:
             counts[2, cells[p]] += 1
     return counts
 

@@ -14,21 +14,19 @@ import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import Grid, Raster, block_sum, cell_of, coarser, grid_over, sample
+from vinemap.bins import quantiles_in
+from vinemap.compiled import in_threads
+from vinemap.raster import Grid, Raster, above, block_sum, coarser, grid_over, sample, window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
+    from vinemap.cloud import Cloud
 
     Values = NDArray[np.float64]
 
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
-STEP, LOWEST, BITS = 0.001, -500.0, 20
-"""Heights are sorted in steps of a millimetre, from so many metres, as integers of so many bits."""
-MOST_STEPS = 2**BITS - 1
 EVEN = 0.02
 """Metres that terrain may rise from cell to cell above what a fit was made along."""
 WEEDS = 0.3
@@ -53,7 +51,7 @@ class _Cells(NamedTuple):
 
 
 def terrain_model(
-    cloud: PointCloud,
+    cloud: Cloud,
     *,
     resolution: float = 0.25,
     quantile: float = 0.1,
@@ -64,7 +62,7 @@ def terrain_model(
 
     Parameters
     ----------
-    cloud : PointCloud
+    cloud : PointCloud or TiledCloud
         Points of terrain, vegetation and whatever stands on it; no classes needed.
     resolution : float
         Cell size in metres.
@@ -80,17 +78,17 @@ def terrain_model(
     Raster
         Elevations in metres (ny, nx).
     """
-    xyz, crs = cloud.xyz, cloud.crs
-    grid = grid_over(xyz, resolution=resolution)
-    wide = coarser(grid, resolution=COARSE)
+    blocks = max(1, round(COARSE / resolution))
+    grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
+    wide = coarser(grid, resolution=blocks * resolution)
     x, y = grid.centres()
-    coarse = Raster(_coarse_surface(xyz, wide), wide, crs)
-    surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, crs)
-    cell = cell_of(xyz, grid)
+    coarse = Raster(_coarse_surface(cloud, grid, blocks), wide, cloud.crs)
+    surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, cloud.crs)
     for _ in range(2):
-        cells = _order_statistics(xyz[:, 2] - sample(surface, xyz), cell, grid, quantile)
+        n, found = _order_statistics(cloud, surface, grid, (quantile, 0.5, 0.9))
+        cells = _Cells(n, *found)
         fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
-        surface = Raster(surface.values + fitted, grid, crs)
+        surface = Raster(surface.values + fitted, grid, cloud.crs)
         # On slopes and terraces that were new to it, soil is thin only once cells lie along them.
         if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
             break
@@ -114,51 +112,50 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
     return _multiscale(level, weight * terrain, 0.3 / resolution)
 
 
-def height_above_ground(cloud: PointCloud, dtm: Raster) -> Values:
-    """Height in metres (n,) of every point above the terrain model."""
-    return cloud.xyz[:, 2] - sample(dtm, cloud.xyz)
-
-
-def canopy_height_model(cloud: PointCloud, heights: NDArray[np.floating], *, resolution: float = 0.25) -> Raster:
+def canopy_height_model(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
     """Canopy height model: the 98% height in metres of each cell's points, NaN where there is none.
 
     A cell stands no higher than the highest of its eight neighbours by more than ``SPIKE``, so that a point in the
-    air doesn't make a tower.
+    air doesn't make a tower. The cloud has its heights, and the resolution is that of its terrain model.
     """
-    grid = grid_over(cloud.xyz, resolution=resolution)
-    cells = _order_statistics(heights, cell_of(cloud.xyz, grid), grid, 0.98)
-    height = np.maximum(cells.low, 0)
+    blocks = max(1, round(COARSE / resolution))
+    grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
+    n, found = _order_statistics(cloud, None, grid, (0.98,))
+    height = np.maximum(found[0], 0)
     around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
     height = np.minimum(height, maximum_filter(height, footprint=around) + SPIKE)
-    return Raster(np.where(cells.n > 0, height, np.nan), grid, cloud.crs)
+    return Raster(np.where(n > 0, height, np.nan), grid, cloud.crs)
 
 
-def _coarse_surface(xyz: Values, grid: Grid) -> Values:
-    """Smooth surface (ny, nx) through the low parts of a cloud, blind to what stands on it or floats below."""
-    reference = float(np.round(xyz[:, 2].mean()))
-    cells = _order_statistics(xyz[:, 2] - reference, cell_of(xyz, grid), grid, 0.05)
+def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Values:
+    """Smooth surface through the low parts of blocks of cells, blind to what stands on them or floats below."""
+    low, high = cloud.extent
+    reference = float(np.round((low[2] + high[2]) / 2))
+    level = Raster(np.full((1, 1), reference), grid, cloud.crs)
+    n, (lowest,) = _order_statistics(cloud, level, grid, (0.05,), blocks=blocks)
+    step = blocks * grid.resolution
     # Local planes are held to zero where cells are few, so the hillside must be gone first: an upper edge that stood
     # out above them would be taken for a house.
-    trend = _trend(cells)
-    cells = cells._replace(low=cells.low - trend)
-    weight = (cells.n > 0).astype(float)
-    surface = np.zeros(grid.shape)
+    held = n > 0
+    trend = _trend(lowest, held)
+    bare = lowest - trend
+    weight = held.astype(float)
+    surface = np.zeros(n.shape)
     for sigma in (8.0, 8.0, 5.0, 5.0, 5.0, 4.0, 4.0, 4.0):
-        surface = _multiscale(cells.low, weight, sigma / COARSE)
-        above = np.where(cells.n > 0, cells.low - surface, 0.0)
-        scale = 0.1 + 1.5 * float(np.median(np.abs(above[cells.n > 0])))
-        asymmetric = np.where(above > 0, above / scale, above / (5 * scale))
-        weight = np.where(cells.n > 0, 1 / (1 + asymmetric**2) ** 2, 0.0)
+        surface = _multiscale(bare, weight, sigma / step)
+        above_it = np.where(held, bare - surface, 0.0)
+        scale = 0.1 + 1.5 * float(np.median(np.abs(above_it[held])))
+        asymmetric = np.where(above_it > 0, above_it / scale, above_it / (5 * scale))
+        weight = np.where(held, 1 / (1 + asymmetric**2) ** 2, 0.0)
     return surface + trend + reference
 
 
-def _trend(cells: _Cells) -> Values:
-    """Quadratic surface (ny, nx) through the cells' low heights, fitted robustly."""
-    ny, nx = cells.n.shape
+def _trend(level: Values, held: NDArray[np.bool_]) -> Values:
+    """Quadratic surface (ny, nx) through the levels of those cells that hold points, fitted robustly."""
+    ny, nx = level.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    held = cells.n > 0
-    design, low = terms[held], cells.low[held]
+    design, low = terms[held], level[held]
     weight = np.ones(len(low))
     coefficients = np.zeros(6)
     for _ in range(10):
@@ -170,36 +167,18 @@ def _trend(cells: _Cells) -> Values:
     return out
 
 
-def _order_statistics(heights: NDArray[np.floating], cells: NDArray[np.int64], grid: Grid, quantile: float) -> _Cells:
-    """Quantiles of heights in cells, by one sort."""
-    metres, keys = np.asarray(heights, dtype=np.float64), np.empty(len(cells), dtype=np.int64)
-    in_threads(lambda part: _fill_keys(*part, metres, cells, keys), stretches(len(keys)))
-    keys.sort()
-    n = _count_keys(keys, grid.ny * grid.nx)
-    first = np.cumsum(n) - n
-
-    def at(q: float) -> Values:
-        rank = np.maximum(np.ceil(q * n).astype(np.int64) - 1, 0)
-        found = keys[np.minimum(first + rank, len(keys) - 1)] & MOST_STEPS
-        return np.where(n > 0, found * STEP + LOWEST, 0.0).reshape(grid.shape)
-
-    return _Cells(n.reshape(grid.shape).astype(float), at(quantile), at(0.5), at(0.9))
-
-
-@compiled
-def _fill_keys(first: int, last: int, heights: Values, cells: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
-    """Integers (n,) that hold a point's cell above and its height below."""
-    for p in range(first, last):
-        step = min(max(int((heights[p] - LOWEST) / STEP), 0), MOST_STEPS)
-        keys[p] = cells[p] << BITS | step
-
-
-@compiled
-def _count_keys(keys: NDArray[np.int64], n_cells: int) -> NDArray[np.int64]:
-    n = np.zeros(n_cells, dtype=np.int64)
-    for key in keys:
-        n[key >> BITS] += 1
-    return n
+def _order_statistics(
+    cloud: Cloud, surface: Raster | None, grid: Grid, quantiles: tuple[float, ...], *, blocks: int = 1
+) -> tuple[Values, Values]:
+    """Counts and quantiles of the heights above a surface, or else above ground, in blocks of a grid's cells."""
+    shape = [side // blocks for side in grid.shape]
+    n, found = np.zeros(shape), np.zeros((len(quantiles), *shape))
+    for part in cloud.parts():
+        around, (rows, columns) = window(grid, *part.extent, multiple=blocks)
+        heights = part.heights if surface is None else above(surface, part.xyz)
+        here = slice(rows.start // blocks, rows.stop // blocks), slice(columns.start // blocks, columns.stop // blocks)
+        n[here], found[:, *here] = quantiles_in(part.bins(around), heights, quantiles, blocks=blocks)
+    return n, found
 
 
 def _depth(n: Values, quantile: float) -> Values:
@@ -276,15 +255,16 @@ def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
     bell /= bell.sum()
     kernels = bell, bell * t, bell * t**2
 
-    def moment(values: Values, a: int, b: int) -> Values:
-        down: Values = correlate1d(values, kernels[a], axis=0, mode="constant")
-        out: Values = correlate1d(down, kernels[b], axis=1, mode="constant")
+    values = weight * level
+    wanted = [(weight, 0, 0), (weight, 1, 0), (weight, 0, 1), (weight, 2, 0), (weight, 1, 1), (weight, 0, 2)]
+    wanted += [(values, 0, 0), (values, 1, 0), (values, 0, 1)]
+
+    def moment(of: tuple[Values, int, int]) -> Values:
+        down: Values = correlate1d(of[0], kernels[of[1]], axis=0, mode="constant")
+        out: Values = correlate1d(down, kernels[of[2]], axis=1, mode="constant")
         return out
 
-    w, wi, wj = moment(weight, 0, 0), moment(weight, 1, 0), moment(weight, 0, 1)
-    wii, wij, wjj = moment(weight, 2, 0), moment(weight, 1, 1), moment(weight, 0, 2)
-    values = weight * level
-    z, zi, zj = moment(values, 0, 0), moment(values, 1, 0), moment(values, 0, 1)
+    w, wi, wj, wii, wij, wjj, z, zi, zj = in_threads(moment, wanted)
     w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
     # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
     a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj

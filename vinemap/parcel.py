@@ -6,6 +6,7 @@ import json
 import platform
 import time
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -13,10 +14,9 @@ import numpy as np
 
 from vinemap import __version__, paths
 from vinemap.blocks import group_blocks
-from vinemap.canopy import find_feet, foliage_reach, section_meshes, separate_canopy
+from vinemap.canopy import find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
 from vinemap.cgon import enclose, grow, peel_sections
 from vinemap.classification import classify_points
-from vinemap.cloud import PointCloud, Sections, read_cloud, write_classified
 from vinemap.clustering import cluster_rows
 from vinemap.confidence import judge_rows
 from vinemap.config import Settings, check_name
@@ -24,8 +24,9 @@ from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
 from vinemap.errors import InputError
-from vinemap.ground import canopy_height_model, height_above_ground, terrain_model
+from vinemap.ground import canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
+from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
 from vinemap.product import fingerprint, labelled, parcel_layer, write_product
 from vinemap.row_field import estimate_row_field, refine_row_field
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.cloud import Cloud, Sections
     from vinemap.raster import Raster, RowField
 
 T = TypeVar("T")
@@ -92,9 +94,10 @@ def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
 class RowMap(NamedTuple):
     """Rows and gaps of a cloud, and what they were found from."""
 
+    cloud: Cloud
+    """The points with their heights above ground."""
     dtm: Raster
-    heights: NDArray[np.floating]
-    """Height above ground (n,) of every point in metres."""
+    chm: Raster
     cover: Raster
     field: RowField
     n_key_points: int
@@ -102,21 +105,29 @@ class RowMap(NamedTuple):
     gaps: gpd.GeoDataFrame
 
 
-def map_rows(points: PointCloud, settings: Settings, *, step: Callable[..., Any] = call) -> RowMap:
+def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster]:
+    """Find the terrain of a cloud: the cloud with its heights above it, the terrain, and the canopies' height."""
+    dtm = terrain_model(points, **settings.ground.model_dump())
+    cloud = points.above(dtm)
+    chm = canopy_height_model(cloud, resolution=settings.ground.resolution)
+    cloud.forget()
+    return cloud, dtm, chm
+
+
+def map_rows(points: Cloud, settings: Settings, *, step: Callable[..., Any] = call) -> RowMap:
     """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2)."""
     options = settings.model_dump()
-    dtm = step("DTM", terrain_model, points, **options["ground"])
-    heights = height_above_ground(points, dtm)
-    cover = step("Canopy cover", canopy_cover, points, heights, **options["cover"])
+    cloud, dtm, chm = step("DTM", map_surfaces, points, settings)
+    cover = step("Canopy cover", canopy_cover, cloud, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
     clusters = step("Clusters", cluster_rows, key_points, **options["clustering"])
     courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     limits = {"low": settings.cover.low, "high": settings.cover.high}
-    fitted = step("Ends and gaps", fit_rows, courses, points, heights, cover, dtm, **limits, **options["fit"])
+    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, dtm, **limits, **options["fit"])
     rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
     rows, gaps = count_missing(judge_rows(rows), gaps, **options["missing"])
-    return RowMap(dtm, heights, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
+    return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 
 def map_parcel(
@@ -179,8 +190,8 @@ def map_parcel(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
             )
         found = map_rows(points, settings, step=run)
-        heights, rows, gaps = found.heights, found.rows, found.gaps
-        canopy, outlines, table, leaves = model_canopies(points, found, settings, step=run)
+        rows, gaps = found.rows, found.gaps
+        canopy, outlines, table, leaves = model_canopies(found, settings, step=run)
         origin = origin or _corner(found.dtm)
         rows, ends, enhanced = describe_rows(
             summarise_rows(rows, table, step=settings.sections.step),
@@ -197,17 +208,16 @@ def map_parcel(
             "gaps": labelled(gaps, rows),
             "parcel": parcel_layer(parcel, rows, polygon, points),
         }
-        chm = canopy_height_model(points, heights, resolution=settings.ground.resolution)
 
         def write() -> None:
             plain = settings.product.plain
-            write_product(draft, parcel, layers, (found.dtm, chm), found.field, meshes, points, plain=plain)
+            write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, plain=plain)
             if settings.product.classified:
-                classes = classify_points(points, heights, _all_leaves(leaves, points, found, settings))
-                write_classified(points, heights, *classes, paths.classified_cloud(draft, parcel))
+                classes = classify_points(found.cloud, _all_leaves(leaves, found, settings))
+                write_classified(found.cloud, *classes, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
-        counts = {"points": len(points.xyz), "key_points_found": found.n_key_points}
+        counts = {"points": points.size, "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
         record = {
@@ -242,23 +252,27 @@ class CanopyModel(NamedTuple):
     """Sections with all canopy points, before outliers are peeled off."""
 
 
-def model_canopies(
-    points: PointCloud, found: RowMap, settings: Settings, *, step: Callable[..., Any] = call
-) -> CanopyModel:
+def model_canopies(found: RowMap, settings: Settings, *, step: Callable[..., Any] = call) -> CanopyModel:
     """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
-    arguments = points, found.heights, found.rows, found.gaps, found.dtm
-    sections = step("Sections", cut_sections, *arguments, **_section_options(settings))
-    model: CanopyModel = step("Canopy", model_sections, sections, settings, points.crs)
+    leaves, soil = step("Sections", find_canopies, found, settings)
+    model: CanopyModel = step("Canopy", model_sections, leaves, soil, settings, found.dtm.crs)
     return model
 
 
-def _section_options(settings: Settings) -> dict[str, Any]:
-    return settings.sections.model_dump() | {"low": settings.cover.low, "high": settings.cover.high}
+def find_canopies(found: RowMap, settings: Settings) -> tuple[Sections, NDArray[np.floating]]:
+    """Cut sections across the rows, and keep those that have a canopy, with its points; and the thesis's feet."""
+    options: dict[str, Any] = settings.sections.model_dump()
+    options |= {"low": settings.cover.low, "high": settings.cover.high}
+    separate = settings.canopy.model_dump()
+    living = {name: separate.pop(name) for name in ("min_points", "min_share")}
+    canopies = cut_sections(
+        found.cloud, found.rows, found.gaps, found.dtm, partial(separate_canopy, **separate), **options
+    )
+    return living_canopies(canopies, **living)
 
 
-def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyModel:
-    """Model the canopies of sections, those that have one, by polygons (section 3.2)."""
-    leaves, soil = separate_canopy(sections, **settings.canopy.model_dump())
+def model_sections(leaves: Sections, soil: NDArray[np.floating], settings: Settings, crs: CRS) -> CanopyModel:
+    """Model the canopies of sections by polygons (section 3.2)."""
     canopy, feet = find_feet(leaves)
     peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
     canopy = canopy.subset(peeled.kept)
@@ -269,21 +283,21 @@ def model_sections(sections: Sections, settings: Settings, crs: CRS) -> CanopyMo
     model = enclose(outline, start, fixed, c=settings.polygon.c, share=0.0, slide=on_foliage)
     # The foot that the sections around tell may leave a young vine nothing.
     valid = model.valid & (np.diff(canopy.start) >= max(3, settings.canopy.min_points // 2))
-    canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
+    if not valid.all():
+        canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
     polygons, foliage = model.polygon[valid], model.hull_area[valid]
     indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
     table = measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
     return CanopyModel(canopy, polygons, table, leaves)
 
 
-def _all_leaves(leaves: Sections, points: PointCloud, found: RowMap, settings: Settings) -> Sections:
+def _all_leaves(leaves: Sections, found: RowMap, settings: Settings) -> Sections:
     """Canopy points of sections that leave nothing between them."""
     options = settings.sections
     if options.step <= options.width:
         return leaves
-    dense = _section_options(settings) | {"step": options.width}
-    sections = cut_sections(points, found.heights, found.rows, found.gaps, found.dtm, **dense)
-    return separate_canopy(sections, **settings.canopy.model_dump())[0]
+    dense = settings.model_copy(update={"sections": options.model_copy(update={"step": options.width})})
+    return find_canopies(found, dense)[0]
 
 
 def _corner(dtm: Raster) -> Origin:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud import PointCloud
+    from vinemap.cloud import Cloud
 
     Boundary = tuple[shapely.Geometry, CRS]
 
@@ -32,9 +32,7 @@ def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFram
     return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
 
 
-def parcel_layer(
-    parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: PointCloud
-) -> gpd.GeoDataFrame:
+def parcel_layer(parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: Cloud) -> gpd.GeoDataFrame:
     """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
     blocks = outline_blocks(rows)
     if boundary or len(blocks) == 0:
@@ -52,12 +50,12 @@ def parcel_layer(
     return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
 
 
-def _extent(points: PointCloud) -> shapely.Geometry:
-    polygon: shapely.Geometry = shapely.box(*points.xyz[:, :2].min(axis=0), *points.xyz[:, :2].max(axis=0))
+def _extent(points: Cloud) -> shapely.Geometry:
+    polygon: shapely.Geometry = shapely.box(*points.extent[0][:2], *points.extent[1][:2])
     return polygon
 
 
-def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: PointCloud) -> dict[str, Any]:
+def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: Cloud) -> dict[str, Any]:
     angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
     return {
         "parcel": name,
@@ -80,7 +78,7 @@ def write_product(
     surfaces: tuple[Raster, Raster],
     field: RowField,
     meshes: list[Mesh],
-    points: PointCloud,
+    points: Cloud,
     *,
     plain: bool = False,
 ) -> None:
@@ -104,11 +102,11 @@ def write_product(
     for kind, (raster, description, unit) in rasters.items():
         resampling = "nearest" if unit == "degree" else "average"
         write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit, resampling=resampling)
-    centre = points.xyz.mean(axis=0)
+    low, high = points.extent
     write_glb(
         meshes,
         paths.canopy_mesh(folder, parcel),
-        origin=tuple(np.round(centre).tolist()),
+        origin=tuple(np.round((low + high) / 2).tolist()),
         crs=points.crs.to_string(),
         extras={"vertical": points.vertical},
         plain=plain,

@@ -64,26 +64,52 @@ class RowField:
     likelihood: Raster
 
 
-def grid_over(xy: ArrayLike, *, resolution: float) -> Grid:
-    """Smallest grid over points (n, ≥2), its edges at multiples of the cell size.
+def grid_over(low: ArrayLike, high: ArrayLike, *, resolution: float, multiple: int = 1) -> Grid:
+    """Smallest grid over an extent (≥2,), (≥2,), its edges at multiples of the cell size, or of several cells'.
 
     Raises
     ------
     InputError
         If it would have more than ``MAX_CELLS`` cells.
     """
-    points = _columns(np.asarray(xy))
-    bounds = np.array(in_threads(lambda part: _bounds(*part, points), stretches(len(points))))
-    west, south = np.floor(bounds[:, :2].min(axis=0) / resolution) * resolution
-    east, north = bounds[:, 2:].max(axis=0)
-    nx = int((east - west) // resolution) + 1
-    ny = int(np.ceil((north - south) / resolution)) + 1
+    (west, south), (east, north) = (np.asarray(corner, dtype=float)[:2] for corner in (low, high))
+    step = multiple * resolution
+    left, bottom = np.floor(west / step) * step, np.floor(south / step) * step
+    nx = (int((east - left) // step) + 1) * multiple
+    ny = (int(np.ceil((north - bottom) / step)) + 1) * multiple
     if nx * ny > MAX_CELLS:
         raise InputError(
             f"the cloud spans {east - west:.0f} m by {north - south:.0f} m, too much for one parcel at "
             f"{resolution} m: clip it with --boundary"
         )
-    return Grid(float(west), float(south + ny * resolution), resolution, ny, nx)
+    return Grid(float(left), float(bottom + ny * resolution), resolution, ny, nx)
+
+
+def window(grid: Grid, low: ArrayLike, high: ArrayLike, *, multiple: int = 1) -> tuple[Grid, tuple[slice, slice]]:
+    """Part of a grid that covers an extent (≥2,), (≥2,), in whole blocks of several cells, and where it lies in it."""
+    (west, south), (east, north) = (np.asarray(corner, dtype=float)[:2] for corner in (low, high))
+    step = multiple * grid.resolution
+    i = [int((grid.north - y) // step) * multiple for y in (north, south)]
+    j = [int((x - grid.west) // step) * multiple for x in (west, east)]
+    rows, columns = (
+        slice(min(max(first, 0), n), min(max(last, 0) + multiple, n))
+        for (first, last), n in zip((i, j), grid.shape, strict=True)
+    )
+    part = Grid(
+        grid.west + columns.start * grid.resolution,
+        grid.north - rows.start * grid.resolution,
+        grid.resolution,
+        rows.stop - rows.start,
+        columns.stop - columns.start,
+    )
+    return part, (rows, columns)
+
+
+def extent(points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and greatest coordinates (k,) of points (n, k)."""
+    table = _columns(points)
+    bounds = np.array(in_threads(lambda part: _bounds(*part, table), stretches(len(table))))
+    return bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
 
 
 def coarser(grid: Grid, *, resolution: float) -> Grid:
@@ -92,10 +118,10 @@ def coarser(grid: Grid, *, resolution: float) -> Grid:
     return Grid(grid.west, grid.north, resolution, ny, nx)
 
 
-def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int64]:
+def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int32]:
     """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
     points = _columns(xy)
-    out = np.empty(len(points), dtype=np.int64)
+    out = np.empty(len(points), dtype=np.int32)
     in_threads(lambda part: _cells(*part, points, grid, out), stretches(len(points)))
     return out
 
@@ -119,6 +145,14 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     return out.reshape(points.shape[:-1])
 
 
+def above(raster: Raster, xyz: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Metres (n,) that points (n, 3) lie above a raster of elevations, as it is sampled."""
+    points, values = _columns(xyz), _columns(raster.values)
+    out = np.empty(len(points), dtype=np.float32)
+    in_threads(lambda part: _above(*part, values, raster.grid, points, out), stretches(len(points)))
+    return out
+
+
 def sample_across(
     raster: Raster, origin: NDArray[np.floating], normal: NDArray[np.floating], offsets: NDArray[np.floating]
 ) -> NDArray[np.float64]:
@@ -135,19 +169,22 @@ def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 @compiled
-def _bounds(first: int, last: int, xy: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    west, south, east, north = np.inf, np.inf, -np.inf, -np.inf
+def _bounds(first: int, last: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    out = np.empty((2, points.shape[1]))
+    out[0], out[1] = np.inf, -np.inf
     for p in range(first, last):
-        west, south = min(west, xy[p, 0]), min(south, xy[p, 1])
-        east, north = max(east, xy[p, 0]), max(north, xy[p, 1])
-    return west, south, east, north
+        for k in range(points.shape[1]):
+            out[0, k] = min(out[0, k], points[p, k])
+            out[1, k] = max(out[1, k], points[p, k])
+    return out
 
 
 @compiled
-def _cells(first: int, last: int, xy: NDArray[np.float64], grid: Grid, out: NDArray[np.int64]) -> None:
+def _cells(first: int, last: int, xy: NDArray[np.float64], grid: Grid, out: NDArray[np.int32]) -> None:
+    scale = 1 / grid.resolution
     for p in range(first, last):
-        j = min(max(int((xy[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
-        i = min(max(int((grid.north - xy[p, 1]) / grid.resolution), 0), grid.ny - 1)
+        j = min(max(int((xy[p, 0] - grid.west) * scale), 0), grid.nx - 1)
+        i = min(max(int((grid.north - xy[p, 1]) * scale), 0), grid.ny - 1)
         out[p] = i * grid.nx + j
 
 
@@ -171,6 +208,14 @@ def _bilinear(
 ) -> None:
     for p in range(first, last):
         out[p] = _value(values, grid, xy[p, 0], xy[p, 1])
+
+
+@compiled
+def _above(
+    first: int, last: int, values: NDArray[np.float64], grid: Grid, xyz: NDArray[np.float64], out: NDArray[np.float32]
+) -> None:
+    for p in range(first, last):
+        out[p] = xyz[p, 2] - _value(values, grid, xyz[p, 0], xyz[p, 1])
 
 
 @compiled

@@ -7,6 +7,7 @@ parcel's place nor its rotation matters.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
@@ -23,19 +24,20 @@ from vinemap.row_frame import (
     centre_line,
     half_width,
     normals,
+    points_of_rows,
     resample,
-    row_coordinates,
     runs_above,
     way_along,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
+    from vinemap.cloud import Cloud, PointCloud
     from vinemap.raster import Grid
+    from vinemap.row_frame import Taken
 
     Values = NDArray[np.floating]
 
@@ -70,18 +72,18 @@ class _Fit(NamedTuple):
 
 
 class _Share(NamedTuple):
-    """Points of one row: where along its n stations, metres to its left, and canopy 0 to 1."""
+    """A row's course (n, 2), the canopy's half width in metres, and points: station, metres to its left, canopy 0–1."""
 
+    curve: Values
+    half: float
     station: Values
     left: Values
     canopy: Values
-    n: int
 
 
 def fit_rows(
     courses: gpd.GeoDataFrame,
-    cloud: PointCloud,
-    heights: Values,
+    cloud: Cloud,
     cover: Raster,
     dtm: Raster,
     *,
@@ -97,10 +99,8 @@ def fit_rows(
     ----------
     courses : GeoDataFrame
         LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
-    cloud : PointCloud
-        The parcel's points.
-    heights : (n,) array
-        Their heights above ground in metres.
+    cloud : PointCloud or TiledCloud
+        The parcel's points with their heights above ground.
     cover : Raster
         Canopy cover; where it is zero there are trees or houses, whose points don't count.
     dtm : Raster
@@ -124,13 +124,14 @@ def fit_rows(
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
-    shares = _deal(cloud, heights, cover, curves, half, low, high)
-    fits = in_threads(
-        lambda one: _fit(*one, smoothing=smoothing, end_share=end_share), list(zip(curves, shares, half, strict=True))
-    )
+    fits: dict[int, _Fit | None] = {}
+    for group, shares in _deal(cloud, cover, curves, half, low, high):
+        found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
+        fits |= dict(zip(group.tolist(), found, strict=True))
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
-    for fit, spacing, alone in zip(fits, courses["spacing_m"], courses["alone"], strict=True):
+    for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True)):
+        fit = fits[k]
         if fit is None or (alone and fit.contrast < LEAST_CONTRAST):
             continue
         empty = np.column_stack([fit.runs[:-1, 1], fit.runs[1:, 0]])
@@ -145,14 +146,14 @@ def fit_rows(
     )
 
 
-def _fit(curve: Values, share: _Share, half: float, *, smoothing: float, end_share: float) -> _Fit | None:
-    """Centre line of a row about its course (n, 2), between the ends of its canopy."""
-    still = np.zeros(share.n)
-    image, offsets = _straighten(share, still, half)
-    cutoff = smoothing / CELL * _noise_stretch(share, half)
-    shift = centre_line(image, offsets, reach=0.75 * half, cutoff=cutoff)
-    centred = curve + shift[:, None] * normals(curve, smoothing=1 / CELL)
-    return _ends(centred, _straighten(share, shift, half)[0], end_share)
+def _fit(share: _Share, *, smoothing: float, end_share: float) -> _Fit | None:
+    """Centre line of a row about its course, between the ends of its canopy."""
+    still = np.zeros(len(share.curve))
+    image, offsets = _straighten(share, still)
+    cutoff = smoothing / CELL * _noise_stretch(share)
+    shift = centre_line(image, offsets, reach=0.75 * share.half, cutoff=cutoff)
+    centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
+    return _ends(centred, _straighten(share, shift)[0], end_share)
 
 
 def _smooth_course(course: Values) -> Values:
@@ -170,24 +171,28 @@ def _smooth_course(course: Values) -> Values:
 
 
 def _deal(
-    cloud: PointCloud, heights: Values, cover: Raster, curves: Sequence[Values], half: Values, low: float, high: float
-) -> list[_Share]:
-    """Each curve's share of the points near it, in its own frame."""
-    if not curves:
-        return []
-    near = row_coordinates(cloud.xyz, curves, half + REACH)
+    cloud: Cloud, cover: Raster, curves: Sequence[Values], half: Values, low: float, high: float
+) -> Iterator[tuple[NDArray[np.int64], list[_Share]]]:
+    """Curves, and of each its share of the points near it, in its own frame."""
     vines = cover.values > 0
-    canopy = np.zeros(len(near.member))
-    in_threads(
-        lambda part: _weigh(*part, cloud.xyz, heights, near.member, vines, cover.grid, (low, high), canopy),
-        stretches(len(canopy)),
-    )
-    shares = []
-    for k, curve in enumerate(curves):
-        mine = slice(near.start[k], near.start[k + 1])
-        station = near.along[mine] * ((len(curve) - 1) / way_along(curve)[-1])
-        shares.append(_Share(station, near.left[mine], canopy[mine], len(curve)))
-    return shares
+
+    def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
+        canopy = np.zeros(len(member), dtype=np.float32)
+        in_threads(
+            lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, vines, cover.grid, (low, high), canopy),
+            stretches(len(canopy)),
+        )
+        return (canopy,)
+
+    for rows, near, (canopy,) in points_of_rows(cloud, curves, half + REACH, canopy_of):
+        shares = []
+        for k, row in enumerate(rows):
+            mine = slice(near.start[k], near.start[k + 1])
+            scale = np.float32((len(curves[row]) - 1) / way_along(curves[row])[-1])
+            shares.append(
+                _Share(curves[row], float(half[row]), near.along[mine] * scale, near.left[mine], canopy[mine])
+            )
+        yield rows, shares
 
 
 @compiled
@@ -196,7 +201,7 @@ def _weigh(
     last: int,
     xyz: Values,
     heights: Values,
-    member: NDArray[np.int64],
+    member: NDArray[np.int32],
     vines: NDArray[np.bool_],
     grid: Grid,
     limits: tuple[float, float],
@@ -213,15 +218,15 @@ def _weigh(
             canopy[k] = rise * min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
 
 
-def _noise_stretch(share: _Share, half: float) -> float:
+def _noise_stretch(share: _Share) -> float:
     """Factor of the smoothing's wavelength: 1 at ``POINTS_A_METRE``, more where points are fewer."""
-    per_metre = float(share.canopy[np.abs(share.left) <= half].sum()) / (share.n * CELL)
+    per_metre = float(share.canopy[np.abs(share.left) <= share.half].sum()) / (len(share.curve) * CELL)
     return float(np.clip((POINTS_A_METRE / max(per_metre, 1.0)) ** 0.2, 0.8, 1.6))
 
 
-def _straighten(share: _Share, shift: Values, half: float) -> tuple[Values, Values]:
+def _straighten(share: _Share, shift: Values) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
-    m = int(np.ceil(half / CELL))
+    m = int(np.ceil(share.half / CELL))
     leaves, everything = _spread(share.station, share.left, share.canopy, shift, m)
     density = max(float(everything.mean()), 1e-9)
     sigma = max(1.0, density**-0.5)

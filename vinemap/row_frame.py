@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 from scipy.ndimage import gaussian_filter1d
 
 from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.raster import grid_over
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from vinemap.cloud import Cloud, PointCloud
     from vinemap.raster import Grid
 
     Values = NDArray[np.floating]
@@ -32,12 +34,16 @@ class RowCoordinates(NamedTuple):
 
     start: NDArray[np.int64]
     """First point (rows + 1,) of each row; ``start[k + 1]`` is past its last."""
-    along: Values
+    along: NDArray[np.float32]
     """Metres (n,) along the row; negative before its start."""
-    left: Values
+    left: NDArray[np.float32]
     """Metres (n,) to its left."""
-    member: NDArray[np.int64]
+    member: NDArray[np.int32]
     """Index (n,) of the point in the cloud."""
+
+
+Taken = tuple["NDArray[np.floating]", ...]
+"""What is taken of points beside their coordinates: arrays (n,)."""
 
 
 class _Guides(NamedTuple):
@@ -49,8 +55,54 @@ class _Guides(NamedTuple):
     tangent: Values
 
 
+class _Lookup(NamedTuple):
+    """Raster (ny, nx) of the nearest guides."""
+
+    grid: Grid
+    nearest: NDArray[np.int32]
+    guides: _Guides
+
+
+def points_of_rows(
+    cloud: Cloud, curves: Sequence[Values], reach: Values, take: Callable[[PointCloud, NDArray[np.int32]], Taken]
+) -> Iterator[tuple[NDArray[np.int64], RowCoordinates, Taken]]:
+    """Refer a cloud's points within ``reach`` (rows,) metres of their nearest curve (k, 2) to it.
+
+    Yields rows (a,), the frame's coordinates of their points row by row, and for each point what ``take`` tells of a
+    part of the cloud and its members: arrays (n,). A cloud in memory is done at once, one in tiles by groups of rows.
+    """
+    if not curves:
+        return
+    lookup = _lookup(curves, reach)
+    for rows in cloud.groups(curves):
+        within = np.full(len(curves), -1.0)
+        within[rows] = reach[rows]
+        found = []
+        for part in cloud.parts(shapely.MultiLineString([curves[k] for k in rows]).buffer(float(reach[rows].max()))):
+            near = _coordinates(part.xyz, lookup, within)
+            found.append((near._replace(member=near.member + np.int32(part.first)), take(part, near.member)))
+        yield rows, *_joined(found, rows)
+
+
 def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> RowCoordinates:
     """Refer the points (n, ≥2) within ``reach`` (rows,) metres of their nearest curve (k, 2) to it."""
+    return _coordinates(xyz, _lookup(curves, reach), reach.astype(float))
+
+
+def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int64]) -> tuple[RowCoordinates, Taken]:
+    """Points of some rows, from several parts, row by row."""
+    n = np.array([np.diff(near.start)[rows] for near, _ in found])
+    start = np.concatenate([[0], np.cumsum(n.sum(axis=0))])
+    tables = [(near.along, near.left, near.member, *taken) for near, taken in found]
+    if len(tables) > 1:
+        order = [(k, near.start[row], near.start[row + 1]) for row in rows for k, (near, _) in enumerate(found)]
+        columns = [np.concatenate([tables[k][c][a:b] for k, a, b in order]) for c in range(len(tables[0]))]
+    else:
+        columns = list(tables[0])
+    return RowCoordinates(start, *columns[:3]), tuple(columns[3:])
+
+
+def _lookup(curves: Sequence[Values], reach: Values) -> _Lookup:
     lengths = [float(way_along(curve)[-1]) for curve in curves]
     positions = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
     guides = _Guides(
@@ -60,21 +112,29 @@ def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> Row
         np.concatenate([tangents(curve, g) for curve, g in zip(curves, positions, strict=True)]),
     )
     widest = float(reach.max()) + GUIDE
-    grid = grid_over(np.concatenate([guides.xy - widest, guides.xy + widest]), resolution=GUIDE)
-    nearest = _nearest_guides(guides.xy, grid, widest)
-    points, within = np.ascontiguousarray(xyz), reach.astype(float)
-    guide = np.empty(len(points), dtype=np.int32)
-    in_threads(lambda part: _find_guides(*part, points, grid, nearest, guides, within, guide), stretches(len(guide)))
-    return RowCoordinates(*_refer(points, guide, guides, len(curves)))
+    grid = grid_over(guides.xy.min(axis=0) - widest, guides.xy.max(axis=0) + widest, resolution=GUIDE)
+    return _Lookup(grid, _nearest_guides(guides.xy, grid, widest), guides)
+
+
+def _coordinates(xyz: Values, lookup: _Lookup, reach: Values) -> RowCoordinates:
+    points = np.ascontiguousarray(xyz)
+    guide, parts = np.empty(len(points), dtype=np.int32), stretches(len(points))
+    counts = np.array(in_threads(lambda part: _find_guides(*part, points, lookup, reach, guide), parts))
+    start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
+    place = start[:-1] + np.cumsum(counts, axis=0) - counts
+    along, left = np.empty((2, start[-1]), dtype=np.float32)
+    out = RowCoordinates(start, along, left, np.empty(start[-1], dtype=np.int32))
+    in_threads(lambda k: _refer(*parts[k], points, guide, lookup.guides, place[k], out), range(len(parts)))
+    return out
 
 
 @compiled
-def _nearest_guides(xy: Values, grid: Grid, reach: float) -> NDArray[np.int64]:
+def _nearest_guides(xy: Values, grid: Grid, reach: float) -> NDArray[np.int32]:
     """Guide (ny, nx) nearest to the centre of every cell, -1 where none is within reach.
 
     It is near enough to the nearest of the cell's points: both project them on about the same tangent.
     """
-    nearest = np.full((grid.ny, grid.nx), -1)
+    nearest = np.full((grid.ny, grid.nx), -1, dtype=np.int32)
     least = np.full((grid.ny, grid.nx), reach**2)
     cells = int(np.ceil(reach / grid.resolution))
     for g in range(len(xy)):
@@ -93,16 +153,17 @@ def _find_guides(
     first: int,
     last: int,
     xyz: Values,
-    grid: Grid,
-    nearest: NDArray[np.int64],
-    guides: _Guides,
+    lookup: _Lookup,
     reach: Values,
     guide: NDArray[np.int32],
-) -> None:
-    """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach."""
+) -> NDArray[np.int64]:
+    """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach; points of each row."""
+    grid, nearest, guides = lookup
+    n = np.zeros(len(reach), dtype=np.int64)
+    scale = 1 / grid.resolution
     for p in range(first, last):
         guide[p] = -1
-        j, i = (xyz[p, 0] - grid.west) / grid.resolution, (grid.north - xyz[p, 1]) / grid.resolution
+        j, i = (xyz[p, 0] - grid.west) * scale, (grid.north - xyz[p, 1]) * scale
         if j < 0 or i < 0 or j >= grid.nx or i >= grid.ny:
             continue
         g = nearest[int(i), int(j)]
@@ -111,31 +172,30 @@ def _find_guides(
         x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
         if abs(guides.tangent[g, 0] * y - guides.tangent[g, 1] * x) <= reach[guides.row[g]]:
             guide[p] = g
+            n[guides.row[g]] += 1
+    return n
 
 
 @compiled
 def _refer(
-    xyz: Values, guide: NDArray[np.int32], guides: _Guides, rows: int
-) -> tuple[NDArray[np.int64], Values, Values, NDArray[np.int64]]:
-    """Start, along, left and member of the points (n, ≥2) that have a guide."""
-    start = np.zeros(rows + 1, dtype=np.int64)
-    for g in guide:
-        if g >= 0:
-            start[guides.row[g] + 1] += 1
-    start = np.cumsum(start)
-    along, left = np.empty(start[-1]), np.empty(start[-1])
-    member = np.empty(start[-1], dtype=np.int64)
-    place = start.copy()
-    for p in range(len(guide)):
+    first: int,
+    last: int,
+    xyz: Values,
+    guide: NDArray[np.int32],
+    guides: _Guides,
+    place: NDArray[np.int64],
+    out: RowCoordinates,
+) -> None:
+    """Write the coordinates of the points (n, ≥2) that have a guide, each row's from its place (rows,) on."""
+    for p in range(first, last):
         g = guide[p]
         if g >= 0:
             x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
             k = place[guides.row[g]]
-            along[k] = guides.along[g] + x * guides.tangent[g, 0] + y * guides.tangent[g, 1]
-            left[k] = guides.tangent[g, 0] * y - guides.tangent[g, 1] * x
-            member[k] = p
+            out.along[k] = guides.along[g] + x * guides.tangent[g, 0] + y * guides.tangent[g, 1]
+            out.left[k] = guides.tangent[g, 0] * y - guides.tangent[g, 1] * x
+            out.member[k] = p
             place[guides.row[g]] += 1
-    return start, along, left, member
 
 
 def at(curve: Values, position: Values) -> Values:

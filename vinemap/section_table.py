@@ -108,7 +108,7 @@ def complexity_reduction(canopy: Sections, *, c: int) -> Values:
 
 
 @compiled
-def _in_the_one_before(member: NDArray[np.int64], start: NDArray[np.int64], row_id: NDArray[np.int64]) -> Values:
+def _in_the_one_before(member: NDArray[np.int32], start: NDArray[np.int64], row_id: NDArray[np.int64]) -> Values:
     """Points (m,) that a section shares with the one before it."""
     out = np.zeros(len(row_id))
     for k in range(1, len(row_id)):

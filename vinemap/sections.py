@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import shapely
 
 from vinemap.cloud import Sections
-from vinemap.compiled import compiled, in_threads
+from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.raster import sample
-from vinemap.row_frame import at, row_coordinates, tangents
+from vinemap.row_frame import at, points_of_rows, tangents
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
+    from vinemap.cloud import Cloud, PointCloud
     from vinemap.raster import Raster
+    from vinemap.row_frame import Taken
 
     Values = NDArray[np.floating]
 
+T = TypeVar("T")
 
 HALF = 0.9
 """Metres to both sides of a row within which points are taken for canopy."""
 
 
 def cut_sections(
-    cloud: PointCloud,
-    heights: Values,
+    cloud: Cloud,
     rows: gpd.GeoDataFrame,
     gaps: gpd.GeoDataFrame,
     dtm: Raster,
+    then: Callable[[Sections], T],
     *,
     width: float = 0.4,
     step: float = 0.25,
@@ -39,21 +44,23 @@ def cut_sections(
     max_width: float = 1.0,
     low: float = 0.5,
     high: float = 2.9,
-) -> Sections:
-    """Cut sections along every row, except where it has no canopy (Eq. 2–3).
+) -> list[T]:
+    """Cut sections along every row, except where it has no canopy (Eq. 2–3), and make something of each row's.
+
+    All sections together have more points than the cloud; what is made of them row by row, on all cores, is less.
 
     Parameters
     ----------
-    cloud : PointCloud
-        The parcel's points.
-    heights : (n,) array
-        Their heights above ground in metres.
+    cloud : PointCloud or TiledCloud
+        The parcel's points with their heights above ground.
     rows : GeoDataFrame
         LineStringZ with ``row_id`` and ``spacing_m``.
     gaps : GeoDataFrame
         Stretches without canopy: ``row_id``, ``start_m``, ``end_m``.
     dtm : Raster
         Terrain, for the sections' origins.
+    then : callable
+        Takes a row's Sections; what it returns is returned for each row.
     width, step : float
         Extent a of a section along γ, and distance b of sections along γ, in metres.
     min_points, max_width : int, float
@@ -61,64 +68,72 @@ def cut_sections(
     low, high : float
         Heights in metres between which points count as canopy.
     """
-    if len(rows) == 0:
-        none = np.empty(0)
-        pairs = np.empty((0, 2))
-        number = np.empty(0, dtype=np.int64)
-        start = np.zeros(1, dtype=np.int64)
-        return Sections(number, none, np.empty((0, 3)), pairs, none, start, pairs, none, number)
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]
-    near = row_coordinates(cloud.xyz, curves, 0.5 * rows["spacing_m"].to_numpy())
-    parts = [_stations(line, gaps[gaps["row_id"] == i], step) for line, i in zip(lines, rows["row_id"], strict=True)]
-    station_row = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts)])
-    position = np.concatenate(parts)
-    bounds = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
+    numbers, spacing = rows["row_id"].to_numpy(), rows["spacing_m"].to_numpy()
 
-    def find(k: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        mine = slice(near.start[k], near.start[k + 1])
-        height = heights[near.member[mine]]
-        canopy = (height >= low) & (height <= high) & (np.abs(near.left[mine]) < HALF)
-        per_metre = max(float(canopy.sum()), 1.0) / max(len(parts[k]) * step, step)
-        a = max(width, min(max_width, min_points / per_metre))
-        return _members(near.along[mine], parts[k], a / 2)
+    def cut(one: tuple[Any, ...]) -> T:
+        row, along, left, member, elevation, height = one
+        position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
+        canopy = float(np.count_nonzero((height >= low) & (height <= high) & (np.abs(left) < HALF)))
+        per_metre = max(canopy, 1.0) / max(len(position) * step, step)
+        n, index = _members(along, position, max(width, min(max_width, min_points / per_metre)) / 2)
+        here = at(curves[row], position)
+        level = sample(dtm, here)
+        return then(
+            Sections(
+                np.full(len(position), numbers[row]),
+                position,
+                np.column_stack([here, level]),
+                tangents(curves[row], position),
+                np.full(len(position), spacing[row]),
+                np.concatenate([[0], np.cumsum(n)]),
+                np.column_stack([left[index], elevation[index] - np.repeat(level, n)]),
+                height[index],
+                member[index],
+            )
+        )
 
-    found = in_threads(find, range(len(lines)))
-    start = np.concatenate([[0], np.cumsum(np.concatenate([n for n, _ in found]))])
-    here = np.concatenate([at(curve, p) for curve, p in zip(curves, parts, strict=True)])
-    tangent = np.concatenate([tangents(curve, p) for curve, p in zip(curves, parts, strict=True)])
-    origin = np.column_stack([here, sample(dtm, here)])
-    points, height, member = np.empty((start[-1], 2)), np.empty(start[-1]), np.empty(start[-1], dtype=np.int64)
+    found: dict[int, T] = {}
+    for group, near, taken in points_of_rows(cloud, curves, 0.5 * spacing, _elevations):
+        columns = (near.along, near.left, near.member, *taken)
+        mine = [slice(a, b) for a, b in pairwise(near.start)]
+        each = [(int(row), *(column[part] for column in columns)) for row, part in zip(group, mine, strict=True)]
+        found |= dict(zip(group.tolist(), in_threads(cut, each), strict=True))
+    return [found[row] for row in range(len(rows))]
 
-    def fill(k: int) -> None:
-        mine, into = slice(near.start[k], near.start[k + 1]), start[bounds[k] : bounds[k + 1] + 1]
-        level = origin[bounds[k] : bounds[k + 1], 2]
-        _fill(found[k][1], near.left[mine], near.member[mine], into, level, cloud.xyz, heights, points, height, member)
 
-    in_threads(fill, range(len(lines)))
-    return Sections(
-        rows["row_id"].to_numpy()[station_row],
-        position,
-        origin,
-        tangent,
-        rows["spacing_m"].to_numpy()[station_row],
-        start,
-        points,
-        height,
-        member,
-    )
+def _elevations(cloud: PointCloud, member: NDArray[np.int32]) -> Taken:
+    """Elevation and height above ground (n,) of a cloud's members."""
+    elevation, height = np.empty((2, len(member)), dtype=np.float32)
+    in_threads(lambda part: _take(*part, cloud.xyz, cloud.heights, member, elevation, height), stretches(len(member)))
+    return elevation, height
 
 
 @compiled
-def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _take(
+    first: int,
+    last: int,
+    xyz: Values,
+    heights: Values,
+    member: NDArray[np.int32],
+    elevation: NDArray[np.float32],
+    height: NDArray[np.float32],
+) -> None:
+    for k in range(first, last):
+        elevation[k], height[k] = xyz[member[k], 2], heights[member[k]]
+
+
+@compiled
+def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """How many points (m,) lie within reach of each position along a row, and which, section after section."""
     m = len(position)
     n = np.zeros(m, dtype=np.int64)
     if m == 0:
-        return n, np.empty(0, dtype=np.int64)
+        return n, np.empty(0, dtype=np.int32)
     step = (position[-1] - position[0]) / m + reach
     table = np.searchsorted(position, position[0] + step * np.arange(int((position[-1] - position[0]) / step) + 2))
-    first = np.empty(len(along), dtype=np.int64)
+    first = np.empty(len(along), dtype=np.int32)
     for p in range(len(along)):
         bin_ = int((along[p] - reach - position[0]) / step)
         k = table[min(max(bin_, 0), len(table) - 1)]
@@ -129,7 +144,7 @@ def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.
             n[k] += 1
             k += 1
     place = np.cumsum(n) - n
-    out = np.empty(n.sum(), dtype=np.int64)
+    out = np.empty(n.sum(), dtype=np.int32)
     for p in range(len(along)):
         k = first[p]
         while k < m and position[k] <= along[p] + reach:
@@ -137,29 +152,6 @@ def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.
             place[k] += 1
             k += 1
     return n, out
-
-
-@compiled
-def _fill(
-    index: NDArray[np.int64],
-    left: Values,
-    member: NDArray[np.int64],
-    start: NDArray[np.int64],
-    level: Values,
-    xyz: Values,
-    heights: Values,
-    points: Values,
-    height: Values,
-    chosen: NDArray[np.int64],
-) -> None:
-    """Write the points, heights and members of a row's sections, whose soil lies at ``level`` (m,)."""
-    for k in range(len(level)):
-        for i in range(start[k], start[k + 1]):
-            p = index[i - start[0]]
-            points[i, 0] = left[p]
-            points[i, 1] = xyz[member[p], 2] - level[k]
-            height[i] = heights[member[p]]
-            chosen[i] = member[p]
 
 
 def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:

@@ -16,10 +16,10 @@ import shapely
 from scipy.optimize import differential_evolution
 
 from vinemap.cli import FILE, plain_errors
-from vinemap.cloud import read_cloud
 from vinemap.config import PolygonOptions, SectionOptions, Settings
 from vinemap.crs import parse_crs
 from vinemap.errors import InputError
+from vinemap.las import read_cloud
 from vinemap.parcel import map_rows, model_canopies
 from vinemap.section_table import modelling_indices
 from vinemap.vector import read_boundary
@@ -27,7 +27,6 @@ from vinemap.vector import read_boundary
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
     from vinemap.parcel import CanopyModel, RowMap
 
     Values = NDArray[np.floating]
@@ -67,9 +66,9 @@ def mean(values: Values) -> float:
     return float(values.mean()) if len(values) else 0.0
 
 
-def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b: float, c: int, foot: str) -> Score:
+def score(found: RowMap, reference: CanopyModel, a: float, b: float, c: int, foot: str) -> Score:
     """Indices of the model [a, b, c] of the rows that were found."""
-    model = _model(points, found, {"width": a, "step": b}, c, foot)
+    model = _model(found, {"width": a, "step": b}, c, foot)
     polygons, known = _between(model, reference, reach=2.5 * b)
     outlines = np.array(shapely.make_valid(shapely.polygons(reference.polygons)))
     drawn = np.full(len(outlines), shapely.Polygon(), dtype=object)
@@ -80,12 +79,12 @@ def score(points: PointCloud, found: RowMap, reference: CanopyModel, a: float, b
     return Score(*modelling_indices(shared, mine, area), model.table["reduction"].to_numpy())
 
 
-def _model(points: PointCloud, found: RowMap, sections: dict[str, float], c: int, foot: str) -> CanopyModel:
+def _model(found: RowMap, sections: dict[str, float], c: int, foot: str) -> CanopyModel:
     settings = Settings(
         sections=SectionOptions.model_validate(sections | {"min_points": 0}),
         polygon=PolygonOptions.model_validate({"c": c, "foot": foot}),
     )
-    return model_canopies(points, found, settings)
+    return model_canopies(found, settings)
 
 
 def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tuple[Values, NDArray[np.bool_]]:
@@ -106,13 +105,13 @@ def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tup
     return out, np.asarray(np.isfinite(out).all(axis=(1, 2)))
 
 
-def reference_model(points: PointCloud, found: RowMap) -> CanopyModel:
+def reference_model(found: RowMap) -> CanopyModel:
     """The foliage's outlines in fine sections, V_ref of Table 3.1."""
-    return _model(points, found, REFERENCE, OUTLINE, "foliage")
+    return _model(found, REFERENCE, OUTLINE, "foliage")
 
 
 def search(
-    points: PointCloud, found: RowMap, reference: CanopyModel, *, seed: int = 0, generations: int = GENERATIONS
+    found: RowMap, reference: CanopyModel, *, seed: int = 0, generations: int = GENERATIONS
 ) -> tuple[float, float, int]:
     """The [a, b, c] of the highest mean Q within the thesis's ranges, to the centimetre, by differential evolution."""
 
@@ -120,7 +119,7 @@ def search(
         return round(float(x[0]), 2), round(float(x[1]), 2), round(float(x[2]))
 
     def loss(x: Values) -> float:
-        return -float(score(points, found, reference, *rounded(x), "foliage").quality.mean())
+        return -float(score(found, reference, *rounded(x), "foliage").quality.mean())
 
     integrality = [False, False, True]
     options = {"seed": seed, "maxiter": generations, "popsize": 6, "polish": False, "tol": 1e-3, "x0": THESIS}
@@ -173,14 +172,14 @@ def main(
     found = some_rows(map_rows(points, Settings()), length)
     if len(found.rows) == 0:
         raise InputError(f"{cloud}: no vine row found, so that there is no canopy to model")
-    reference = reference_model(points, found)
+    reference = reference_model(found)
     if len(reference.table) == 0:
         raise InputError(f"{cloud}: has too few points for sections of its canopies")
-    best = search(points, found, reference, generations=generations)
+    best = search(found, reference, generations=generations)
     models = {"best": (*best, "foliage"), "the thesis's": (*THESIS, "foliage"), "on the soil": (*THESIS, "soil")}
     scores = {}
     for name, (a, b, c, foot) in models.items():
-        scores[f"{name} [{a:g}, {b:g}, {c}]"] = score(points, found, reference, a, b, c, foot)
+        scores[f"{name} [{a:g}, {b:g}, {c}]"] = score(found, reference, a, b, c, foot)
     for name, one in scores.items():
         good, under, over, reduction = (mean(v) for v in (one.good, one.under, one.over, one.reduction))
         click.echo(

@@ -6,9 +6,9 @@ import pytest
 import shapely
 from pyproj import CRS, Transformer
 
-from vinemap.cloud import read_cloud
 from vinemap.crs import parse_crs
 from vinemap.errors import InputError
+from vinemap.las import read_cloud
 
 UTM = CRS.from_epsg(32632)
 

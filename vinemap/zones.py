@@ -1,0 +1,114 @@
+"""Which of several polygons hold a point: looked up in cells, and asked of the polygons only along their outlines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import shapely
+from scipy.ndimage import binary_dilation
+
+from vinemap.compiled import compiled
+from vinemap.raster import Grid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Points = NDArray[np.float64]
+    Labels = NDArray[np.int32]
+    Indices = NDArray[np.int64]
+
+CELL = 0.5
+"""Metres of a cell, at the least."""
+MOST_CELLS = 4_000_000
+NOWHERE, ASK = -1, -2
+"""What a cell says beside the number of the one polygon that covers it: none touches it, or ask the polygons."""
+
+
+class Zones(NamedTuple):
+    """Polygons, and a raster (ny, nx) that tells of its cells which polygon covers them."""
+
+    polygons: Sequence[shapely.Geometry]
+    grid: Grid
+    code: Labels
+
+
+def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
+    """Zones of polygons with finite coordinates in metres; they may overlap."""
+    shapely.prepare(np.array(polygons))
+    west, south, east, north = shapely.total_bounds(np.array(polygons))
+    cell = max(CELL, float(np.sqrt((east - west) * (north - south) / MOST_CELLS)))
+    # A cell more on each side, so that what lies on an outline never falls off the raster.
+    grid = Grid(west - cell, north + cell, cell, int((north - south) / cell) + 3, int((east - west) / cell) + 3)
+    code = np.full(grid.shape, NOWHERE, dtype=np.int32)
+    x, y = grid.centres()
+    for k, polygon in enumerate(polygons):
+        inside = np.zeros(grid.shape, dtype=bool)
+        west, south, east, north = shapely.bounds(polygon)
+        near = np.ix_(np.flatnonzero((y >= south) & (y <= north)), np.flatnonzero((x >= west) & (x <= east)))
+        inside[near] = shapely.contains_xy(polygon, *(v[near] for v in np.meshgrid(x, y)))
+        line = shapely.get_coordinates(shapely.segmentize(shapely.boundary(polygon), cell))
+        edge = np.zeros(grid.shape, dtype=bool)
+        edge[((grid.north - line[:, 1]) / cell).astype(int), ((line[:, 0] - grid.west) / cell).astype(int)] = True
+        edge = binary_dilation(edge, np.ones((3, 3)))
+        code[inside] = np.where(code[inside] == NOWHERE, k, ASK)
+        code[edge] = ASK
+    return Zones(polygons, grid, code)
+
+
+def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
+    """Give every polygon its points; those in none go to nobody, those in several to each.
+
+    Returns
+    -------
+    xyz : (m, 3) array
+        The points (n, 3) polygon by polygon, in their order.
+    start : (k + 1,) array
+        Where each polygon's begin.
+    """
+    label = np.empty(len(xyz), dtype=np.int32)
+    _look_up(xyz, zones.grid, zones.code, label)
+    asked = np.flatnonzero(label == ASK)
+    label[asked] = NOWHERE
+    again, into = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int32)]
+    x, y = xyz[asked, 0], xyz[asked, 1]
+    for k, polygon in enumerate(zones.polygons if len(asked) else ()):
+        west, south, east, north = shapely.bounds(polygon)
+        near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
+        inside = asked[near[shapely.contains_xy(polygon, x[near], y[near])]]
+        taken = label[inside] != NOWHERE
+        label[inside[~taken]] = k
+        again.append(inside[taken])
+        into.append(np.full(np.count_nonzero(taken), k, dtype=np.int32))
+    return _gather(xyz, label, np.concatenate(again), np.concatenate(into), len(zones.polygons))
+
+
+@compiled
+def _look_up(xyz: Points, grid: Grid, code: Labels, label: Labels) -> None:
+    for p in range(len(xyz)):
+        j, i = (xyz[p, 0] - grid.west) / grid.resolution, (grid.north - xyz[p, 1]) / grid.resolution
+        inside = 0 <= j < grid.nx and 0 <= i < grid.ny
+        label[p] = code[int(i), int(j)] if inside else NOWHERE
+
+
+@compiled
+def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) -> tuple[Points, Indices]:
+    """Points by label (n,), and those ``again`` that a further polygon holds, behind its others."""
+    start = np.zeros(k + 1, dtype=np.int64)
+    for zone in label:
+        if zone >= 0:
+            start[zone + 1] += 1
+    for zone in into:
+        start[zone + 1] += 1
+    start = np.cumsum(start)
+    out, place = np.empty((start[-1], 3)), start[:-1].copy()
+    for p in range(len(label)):
+        if label[p] >= 0:
+            out[place[label[p]]] = xyz[p]
+            place[label[p]] += 1
+    for q in range(len(into)):
+        out[place[into[q]]] = xyz[again[q]]
+        place[into[q]] += 1
+    return out, start
