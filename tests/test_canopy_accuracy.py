@@ -9,7 +9,7 @@ from vinemap.canopy_accuracy import compare_canopies, pool_canopies
 from vinemap.cloud import Sections
 from vinemap.parcel import CanopyModel, RowMap
 from vinemap.scenes import hillside, rows_of
-from vinemap.section_table import measure_sections
+from vinemap.section_table import measure_sections, tabulate_sections
 from vinemap.synthetic import Vineyard, foliage_outlines, simulate
 
 
@@ -33,9 +33,8 @@ def model(survey, grown=0.0):
     origin = np.column_stack([foliage.xy, np.zeros(m)])
     start = np.arange(0, 4 * m + 1, 4)
     canopy = Sections(foliage.row + 1, position, origin, way, np.full(m, 2.5), start, points, tops, np.arange(4 * m))
-    ones = np.ones(m)
-    table = measure_sections(canopy, foliage.bottom, drawn, area, (ones, 0 * ones, 0 * ones), crs=survey.rows.crs)
-    return CanopyModel(canopy, drawn, table, canopy)
+    measures = measure_sections(canopy, foliage.bottom, (area, area, area), c=drawn.shape[1])
+    return CanopyModel(canopy, drawn, tabulate_sections(canopy, drawn, measures, crs=survey.rows.crs))
 
 
 def errors(survey, ours):

@@ -8,7 +8,7 @@ from vinemap.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
 from vinemap.cloud import PointCloud
 from vinemap.config import Settings
 from vinemap.las import write_classified
-from vinemap.parcel import map_rows, model_canopies
+from vinemap.parcel import find_canopies, map_rows
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def classified(cloud):
     flyers = middle + np.column_stack([np.linspace(-9, 9, 10), np.linspace(9, -9, 10), np.full(10, 12.0)])
     flown = PointCloud(np.concatenate([cloud.xyz, flyers]), cloud.crs)
     found = map_rows(flown, Settings())
-    leaves = model_canopies(found, Settings()).leaves
+    leaves = [canopy.sections for canopy in find_canopies(found, Settings())]
     return flown, found, *classify_points(found.cloud, leaves)
 
 
@@ -52,7 +52,7 @@ def test_canopy_knows_its_row(classified, vineyard):
 def test_a_cloud_without_canopy(cloud):
     flat = PointCloud(cloud.xyz[:1000] * [1, 1, 0], cloud.crs)
     found = map_rows(flat, Settings())
-    leaves = model_canopies(found, Settings()).leaves
+    leaves = [canopy.sections for canopy in find_canopies(found, Settings())]
     classes, row_id = classify_points(found.cloud, leaves)
     assert (classes == GROUND).all()
     assert (row_id == 0).all()

@@ -12,12 +12,19 @@ from pyproj import CRS
 
 from vinemap.canopy import find_feet, foliage_reach, living_canopies, separate_canopy
 from vinemap.cgon import peel_sections
-from vinemap.cloud import PointCloud, Sections, join
+from vinemap.cloud import NO_SECTIONS, PointCloud, Sections, join
 from vinemap.config import Settings
 from vinemap.ground import terrain_model
 from vinemap.parcel import model_sections
 from vinemap.raster import Grid, Raster
-from vinemap.section_table import complexity_reduction, measure_sections, modelling_indices, quantile_of, summarise_rows
+from vinemap.section_table import (
+    complexity_reduction,
+    measure_sections,
+    modelling_indices,
+    quantile_of,
+    summarise_rows,
+    tabulate_sections,
+)
 from vinemap.sections import cut_sections
 
 UTM = CRS.from_epsg(32632)
@@ -40,7 +47,7 @@ def cut(xyz, rows, gaps, dtm, **options):
 
 
 def separate(sections):
-    """Canopy points of sections, and the thesis's feet."""
+    """The canopy of the sections that have one."""
     return living_canopies([separate_canopy(sections)])
 
 
@@ -102,9 +109,11 @@ def test_no_rows_no_sections():
     xyz = np.zeros((5, 3))
     cloud = PointCloud(xyz, UTM, heights=xyz[:, 2])
     canopies = cut_sections(cloud, rows_frame([]), gaps_frame(), flat(-5, -5), separate_canopy)
-    canopy, feet = find_feet(living_canopies(canopies)[0])
+    assert living_canopies(canopies) == []
+    canopy, feet = find_feet(NO_SECTIONS)
     none = np.empty(0)
-    table = measure_sections(canopy, none, np.empty((0, 7, 2)), none, (none, none, none), crs=UTM)
+    measures = measure_sections(canopy, none, (none, none, none), c=7)
+    table = tabulate_sections(canopy, np.empty((0, 7, 2)), measures, crs=UTM)
     assert len(table) == len(feet) == 0
     assert len(summarise_rows(rows_frame([]), table, step=0.25)) == 0
 
@@ -112,7 +121,8 @@ def test_no_rows_no_sections():
 def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     dtm = terrain_model(cloud)
     truth = vineyard.rows.assign(row_id=vineyard.rows["row"], spacing_m=2.5)
-    canopy, soil = living_canopies(cut_sections(cloud.above(dtm), truth, gaps_frame(), dtm, separate_canopy))
+    canopies = living_canopies(cut_sections(cloud.above(dtm), truth, gaps_frame(), dtm, separate_canopy))
+    canopy, soil = join([c.sections for c in canopies]), np.concatenate([c.soil for c in canopies])
     # Sections where vines are dead fall away, those of living vines stay.
     dead = vineyard.dead_vines
     dead = dead[dead.groupby("row")["vine"].transform("size") >= 3]
@@ -130,8 +140,9 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     assert np.abs(np.median(soil[:, 1:, 1], axis=0)).max() < 0.3
     assert (feet[:, 1, 0] >= feet[:, 2, 0]).all()
     m = len(canopy.row_id)
-    ones = np.ones(m)
-    table = measure_sections(canopy, feet[:, 0, 1], feet, 0.5 * ones, (ones, 0 * ones, 0 * ones), crs=UTM)
+    half = 0.5 * np.ones(m)
+    measures = measure_sections(canopy, feet[:, 0, 1], (half, half, half), c=3)
+    table = tabulate_sections(canopy, feet, measures, crs=UTM)
     rows = summarise_rows(truth, table, step=0.25)
     assert np.abs(rows["height_m"] - truth["mean_height"]).max() < 0.08
     assert np.abs(rows["width_m"] - truth["mean_width"]).max() < 0.12
@@ -160,7 +171,7 @@ def test_soil_noise_on_flat_ground_is_no_canopy():
     rng = np.random.default_rng(0)
     soil = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.normal(0, 0.03, 200)])
     leaves = np.column_stack([rng.normal(0, 0.2, 100), rng.uniform(0.6, 1.9, 100)])
-    canopy, _ = separate(one_section(np.concatenate([soil, leaves])))
+    ((canopy, _, _),) = separate(one_section(np.concatenate([soil, leaves])))
     assert len(canopy.points) > 90
     assert canopy.points[:, 1].min() > 0.5
 
@@ -169,7 +180,7 @@ def test_flyers_are_no_canopy():
     rng = np.random.default_rng(0)
     leaves = np.column_stack([rng.normal(0, 0.15, 150), rng.uniform(0.6, 1.9, 150)])
     flyers = np.array([[0.85, 1.5], [-0.8, 2.6], [0.7, 2.2]])
-    canopy, _ = separate(one_section(np.concatenate([leaves, flyers])))
+    ((canopy, _, _),) = separate(one_section(np.concatenate([leaves, flyers])))
     assert np.abs(canopy.points[:, 0]).max() < 0.6
     assert canopy.points[:, 1].max() < 2.0
 
@@ -243,9 +254,8 @@ def test_volumes_of_rows_and_of_hectares():
     points = [np.column_stack([rng.uniform(-0.25, 0.25, 4000), rng.uniform(0.5, 2.0, 4000)]) for _ in range(41)]
     sections = many_sections(points, spacing=2.0)
     ones = np.ones(41)
-    table = measure_sections(
-        sections, 0.5 * ones, np.zeros((41, 7, 2)), 0.75 * ones, (ones, 0 * ones, 0 * ones), crs=UTM
-    )
+    measures = measure_sections(sections, 0.5 * ones, (0.75 * ones, 0.75 * ones, 0.75 * ones), c=7)
+    table = tabulate_sections(sections, np.zeros((41, 7, 2)), measures, crs=UTM)
     assert table["height_m"].mean() == pytest.approx(1.98, abs=0.01)
     assert table["width_m"].mean() == pytest.approx(0.48, abs=0.01)
     assert np.allclose(table["trv_m3_ha"], table["height_m"] * table["width_m"] * 10_000 / 2.0)
@@ -271,8 +281,8 @@ points_of = st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-0.3, 3)), max_si
 def test_any_sections_give_a_defined_model(sections):
     """Sections without points, with three, on a line, of one point many times, of one side only."""
     points = [np.array(p, dtype=float).reshape(-1, 2) for p in sections]
-    model = model_sections(*separate(many_sections(points)), Settings(), UTM)
-    assert len(model.polygons) == len(model.table) == len(model.canopy.row_id)
+    model = model_sections(separate(many_sections(points)), Settings(), UTM)
+    assert len(model.polygons) == len(model.table) == len(model.at.row_id)
     assert np.isfinite(model.polygons).all()
     assert np.isfinite(model.table.drop(columns="geometry").to_numpy()).all()
     assert (model.table["n_points"] >= 3).all()
@@ -282,7 +292,7 @@ def test_any_sections_give_a_defined_model(sections):
 def test_a_million_points_in_a_section():
     rng = np.random.default_rng(0)
     crowd = np.column_stack([rng.normal(0, 0.15, 1_000_000), rng.uniform(0.5, 2, 1_000_000)])
-    model = model_sections(*separate(many_sections([crowd, crowd[:200]])), Settings(), UTM)
+    model = model_sections(separate(many_sections([crowd, crowd[:200]])), Settings(), UTM)
     assert model.table["n_points"].max() > 900_000
     assert model.table["height_m"].iloc[0] == pytest.approx(1.98, abs=0.01)
 
@@ -291,6 +301,6 @@ def test_a_row_shorter_than_a_step():
     xyz = np.column_stack([np.random.default_rng(0).uniform([0, -0.2, 0.5], [0.1, 0.2, 2], (500, 3))])
     rows = rows_frame([np.array([[0, 0], [0.1, 0]])])
     sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
-    model = model_sections(*separate(sections), Settings(), UTM)
+    model = model_sections(separate(sections), Settings(), UTM)
     assert len(model.table) == 2
     assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1

@@ -81,7 +81,7 @@ def modelled(shared):
 def test_canopies_against_the_true_profile(modelled, shared, name):
     found, model = modelled(name)
     with np.load(shared / "surveys" / name / "profiles.npz") as profiles:
-        true, living = true_outlines(profiles, model.canopy)
+        true, living = true_outlines(profiles, model.at)
     shared_area = shapely.area(shapely.intersection(shapely.make_valid(shapely.polygons(model.polygons)), true))
     good, under, over = modelling_indices(
         shared_area[living], shapely.area(shapely.polygons(model.polygons))[living], shapely.area(true)[living]
@@ -126,7 +126,7 @@ def test_the_real_row(shared):
     assert rows["height_m"].iloc[0] == pytest.approx(1.5, abs=0.15)
     assert rows["width_m"].iloc[0] == pytest.approx(0.43, abs=0.06)
     assert rows["bottom_m"].iloc[0] == pytest.approx(0.5, abs=0.1)
-    (mesh,) = section_meshes(model.canopy, model.polygons, rows, step=0.25)
+    (mesh,) = section_meshes(model.at, model.polygons, rows, step=0.25)
     assert volume(mesh) == pytest.approx(rows["volume_m3"].iloc[0], rel=0.1)
 
 

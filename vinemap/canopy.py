@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.cloud import NO_SECTIONS, join
+from vinemap.cloud import NO_SECTIONS
 from vinemap.compiled import compiled, in_threads, stretches
 from vinemap.mesh import Mesh, loft, merge
 
@@ -51,6 +51,9 @@ class Canopy(NamedTuple):
     """Share (m,) of a section's points that are high."""
 
 
+NO_CANOPY = Canopy(NO_SECTIONS, np.empty((0, 3, 2)), np.empty(0))
+
+
 def separate_canopy(
     sections: Sections,
     *,
@@ -90,10 +93,8 @@ def separate_canopy(
     return Canopy(sections.subset(keep), soil, tall)
 
 
-def living_canopies(
-    canopies: Sequence[Canopy], *, min_points: int = 8, min_share: float = 0.15
-) -> tuple[Sections, Values]:
-    """Join the rows' canopies, of those sections that have one.
+def living_canopies(canopies: Sequence[Canopy], *, min_points: int = 8, min_share: float = 0.15) -> list[Canopy]:
+    """Keep the sections that have a canopy, and the rows that have such sections.
 
     Parameters
     ----------
@@ -103,25 +104,16 @@ def living_canopies(
         Points that a section must have.
     min_share : float
         Share of the median section's points that a section must have.
-
-    Returns
-    -------
-    canopy : Sections
-        Canopy points of m sections.
-    soil : (m, 3, 2) array
-        The thesis's fixed vertices of their c-gons.
     """
-    if not canopies:
-        return NO_SECTIONS, np.empty((0, 3, 2))
-    n = np.concatenate([np.diff(canopy.sections.start) for canopy in canopies])
+    n = np.concatenate([np.empty(0), *(np.diff(canopy.sections.start) for canopy in canopies)])
     least = max(float(min_points), min_share * float(np.median(n[n > 0])) if n.any() else 0.0)
-    kept, soil = [], []
-    for canopy in canopies:
-        own = np.diff(canopy.sections.start)
-        enough = (own >= least) & (canopy.tall >= TALL)
-        kept.append(canopy.sections.subset(np.repeat(enough, own), enough))
-        soil.append(canopy.soil[enough])
-    return join(kept), np.concatenate(soil)
+    out = []
+    for sections, soil, tall in canopies:
+        own = np.diff(sections.start)
+        enough = (own >= least) & (tall >= TALL)
+        if enough.any():
+            out.append(Canopy(sections.subset(np.repeat(enough, own), enough), soil[enough], tall[enough]))
+    return out
 
 
 @compiled

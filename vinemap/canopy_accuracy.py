@@ -100,7 +100,7 @@ def _slabs(foliage: Foliage) -> Array:
 
 
 def _against_truth(foliage: Foliage, outlines: Array, model: CanopyModel) -> tuple[Array, Array, Array]:
-    canopy = model.canopy
+    canopy = model.at
     distance, nearest = cKDTree(foliage.xy).query(canopy.origin[:, :2])
     known = distance < NEAR
     at, tangent = nearest[known], canopy.tangent[known]

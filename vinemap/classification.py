@@ -8,6 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from vinemap.cloud import PointCloud, Sections
@@ -21,7 +23,7 @@ COMPANIONS = 3
 
 def classify_points(
     cloud: PointCloud,
-    leaves: Sections,
+    leaves: Sequence[Sections],
     *,
     ground: float = 0.1,
     air: float = 0.5,
@@ -33,7 +35,7 @@ def classify_points(
     ----------
     cloud : PointCloud
         n points with their heights above ground.
-    leaves : Sections
+    leaves : sequence of Sections
         Canopy points of the rows' sections.
     ground : float
         Metres above or below the terrain model within which points are ground.
@@ -54,7 +56,10 @@ def classify_points(
     classes[np.abs(heights) <= ground] = GROUND
     aloft = np.flatnonzero(np.abs(heights) > air)
     canopy = np.zeros(len(heights), dtype=bool)
-    canopy[leaves.member] = True
+    row_id = np.zeros(len(heights), dtype=np.uint16)
+    for sections in leaves:
+        canopy[sections.member] = True
+        row_id[sections.member] = np.repeat(sections.row_id, np.diff(sections.start))
     lone = aloft[~canopy[aloft]]
     if len(lone):
         (west, south, _), (east, north, _) = cloud.extent
@@ -63,6 +68,4 @@ def classify_points(
         distance, _ = cKDTree(cloud.xyz[aloft]).query(cloud.xyz[lone], COMPANIONS + 1, workers=-1)
         classes[lone[distance[:, -1] > near]] = NOISE
     classes[canopy] = CANOPY
-    row_id = np.zeros(len(heights), dtype=np.uint16)
-    row_id[leaves.member] = np.repeat(leaves.row_id, np.diff(leaves.start))
     return classes, row_id

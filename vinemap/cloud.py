@@ -123,6 +123,10 @@ class Sections(NamedTuple):
             member,
         )
 
+    def without_points(self) -> Sections:
+        """The sections as places."""
+        return Sections(*self[:5], np.zeros_like(self.start), self.points[:0], self.height[:0], self.member[:0])
+
 
 NO_SECTIONS = Sections(
     np.empty(0, dtype=np.int64),

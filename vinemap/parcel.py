@@ -14,10 +14,12 @@ import numpy as np
 
 from vinemap import __version__, paths
 from vinemap.blocks import group_blocks
-from vinemap.canopy import find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
+from vinemap.canopy import NO_CANOPY, find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
 from vinemap.cgon import enclose, grow, peel_sections
 from vinemap.classification import classify_points
+from vinemap.cloud import join
 from vinemap.clustering import cluster_rows
+from vinemap.compiled import in_threads
 from vinemap.confidence import judge_rows
 from vinemap.config import Settings, check_name
 from vinemap.cover import canopy_cover
@@ -32,18 +34,19 @@ from vinemap.product import fingerprint, labelled, parcel_layer, write_product
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
-from vinemap.section_table import measure_sections, modelling_indices, summarise_rows
+from vinemap.section_table import Measures, measure_sections, summarise_rows, tabulate_sections
 from vinemap.sections import cut_sections
 from vinemap.vector import read_boundary
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     import geopandas as gpd
     from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.canopy import Canopy
     from vinemap.cloud import Cloud, Sections
     from vinemap.raster import Raster, RowField
 
@@ -191,20 +194,20 @@ def map_parcel(
             )
         found = map_rows(points, settings, step=run)
         rows, gaps = found.rows, found.gaps
-        canopy, outlines, table, leaves = model_canopies(found, settings, step=run)
+        model = model_canopies(found, settings, step=run)
         origin = origin or _corner(found.dtm)
         rows, ends, enhanced = describe_rows(
-            summarise_rows(rows, table, step=settings.sections.step),
+            summarise_rows(rows, model.table, step=settings.sections.step),
             parcel=parcel,
             origin=origin,
             threshold=settings.curves.threshold,
         )
-        meshes = run("Mesh", section_meshes, canopy, outlines, rows, step=settings.sections.step)
+        meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=settings.sections.step)
         layers = {
             "rows": rows,
             "row_ends": ends,
             "key_points": enhanced,
-            "sections": labelled(table, rows),
+            "sections": labelled(model.table, rows),
             "gaps": labelled(gaps, rows),
             "parcel": parcel_layer(parcel, rows, polygon, points),
         }
@@ -213,13 +216,13 @@ def map_parcel(
             plain = settings.product.plain
             write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, plain=plain)
             if settings.product.classified:
-                classes = classify_points(found.cloud, _all_leaves(leaves, found, settings))
+                classes = classify_points(found.cloud, _leaves(found, settings))
                 write_classified(found.cloud, *classes, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
         counts = {"points": points.size, "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
-        modelling = table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+        modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
         record = {
             "vinemap": __version__,
             "parcel": parcel,
@@ -230,7 +233,7 @@ def map_parcel(
             "vertical_datum": points.vertical,
             "origin": origin._asdict(),
             "counts": counts,
-            "modelling": modelling.to_dict() if len(table) else None,
+            "modelling": modelling.to_dict() if len(model.table) else None,
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
             "versions": {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES},
             "files": sorted(path.name for path in draft.iterdir()),
@@ -242,25 +245,23 @@ def map_parcel(
 class CanopyModel(NamedTuple):
     """Canopies of a cloud's rows as polygons across them."""
 
-    canopy: Sections
-    """m sections with their canopy points."""
+    at: Sections
+    """m sections that have a canopy, without their points."""
     polygons: NDArray[np.float64]
     """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
     table: gpd.GeoDataFrame
     """The sections in numbers."""
-    leaves: Sections
-    """Sections with all canopy points, before outliers are peeled off."""
 
 
 def model_canopies(found: RowMap, settings: Settings, *, step: Callable[..., Any] = call) -> CanopyModel:
     """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
-    leaves, soil = step("Sections", find_canopies, found, settings)
-    model: CanopyModel = step("Canopy", model_sections, leaves, soil, settings, found.dtm.crs)
+    canopies = step("Sections", find_canopies, found, settings)
+    model: CanopyModel = step("Canopy", model_sections, canopies, settings, found.dtm.crs)
     return model
 
 
-def find_canopies(found: RowMap, settings: Settings) -> tuple[Sections, NDArray[np.floating]]:
-    """Cut sections across the rows, and keep those that have a canopy, with its points; and the thesis's feet."""
+def find_canopies(found: RowMap, settings: Settings) -> list[Canopy]:
+    """Cut sections across the rows, and keep those that have a canopy, with its points, row by row."""
     options: dict[str, Any] = settings.sections.model_dump()
     options |= {"low": settings.cover.low, "high": settings.cover.high}
     separate = settings.canopy.model_dump()
@@ -271,33 +272,45 @@ def find_canopies(found: RowMap, settings: Settings) -> tuple[Sections, NDArray[
     return living_canopies(canopies, **living)
 
 
-def model_sections(leaves: Sections, soil: NDArray[np.floating], settings: Settings, crs: CRS) -> CanopyModel:
+def model_sections(canopies: Sequence[Canopy], settings: Settings, crs: CRS) -> CanopyModel:
     """Model the canopies of sections by polygons (section 3.2)."""
-    canopy, feet = find_feet(leaves)
-    peeled = peel_sections(canopy.points, canopy.start, share=settings.polygon.share)
-    canopy = canopy.subset(peeled.kept)
-    reach = foliage_reach(canopy, peeled.area, peeled.perimeter, peeled.vertices)
-    outline, start, grown = grow(canopy.points, canopy.start, feet, reach)
-    on_foliage = settings.polygon.foot == "foliage"
-    fixed = grown if on_foliage else soil
-    model = enclose(outline, start, fixed, c=settings.polygon.c, share=0.0, slide=on_foliage)
+    models = in_threads(partial(_model_row, settings=settings), canopies or [NO_CANOPY])
+    at = join([model.at for model in models])
+    polygons = np.concatenate([model.polygons for model in models])
+    measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))
+    return CanopyModel(at, polygons, tabulate_sections(at, polygons, measures, crs=crs))
+
+
+class _RowModel(NamedTuple):
+    at: Sections
+    polygons: NDArray[np.float64]
+    measures: Measures
+
+
+def _model_row(canopy: Canopy, *, settings: Settings) -> _RowModel:
+    """Polygons of a row's sections."""
+    options = settings.polygon
+    sections, feet = find_feet(canopy.sections)
+    peeled = peel_sections(sections.points, sections.start, share=options.share)
+    sections = sections.subset(peeled.kept)
+    reach = foliage_reach(sections, peeled.area, peeled.perimeter, peeled.vertices)
+    outline, start, grown = grow(sections.points, sections.start, feet, reach)
+    on_foliage = options.foot == "foliage"
+    model = enclose(outline, start, grown if on_foliage else canopy.soil, c=options.c, share=0.0, slide=on_foliage)
     # The foot that the sections around tell may leave a young vine nothing.
-    valid = model.valid & (np.diff(canopy.start) >= max(3, settings.canopy.min_points // 2))
+    valid = model.valid & (np.diff(sections.start) >= max(3, settings.canopy.min_points // 2))
     if not valid.all():
-        canopy = canopy.subset(np.repeat(valid, np.diff(canopy.start)), valid)
-    polygons, foliage = model.polygon[valid], model.hull_area[valid]
-    indices = modelling_indices(model.shared_area[valid], model.area[valid], foliage)
-    table = measure_sections(canopy, grown[valid, 0, 1], polygons, foliage, indices, crs=crs)
-    return CanopyModel(canopy, polygons, table, leaves)
+        sections = sections.subset(np.repeat(valid, np.diff(sections.start)), valid)
+    areas = model.shared_area[valid], model.area[valid], model.hull_area[valid]
+    measures = measure_sections(sections, grown[valid, 0, 1], areas, c=options.c)
+    return _RowModel(sections.without_points(), model.polygon[valid], measures)
 
 
-def _all_leaves(leaves: Sections, found: RowMap, settings: Settings) -> Sections:
+def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
     """Canopy points of sections that leave nothing between them."""
     options = settings.sections
-    if options.step <= options.width:
-        return leaves
-    dense = settings.model_copy(update={"sections": options.model_copy(update={"step": options.width})})
-    return find_canopies(found, dense)[0]
+    dense = options.model_copy(update={"step": min(options.step, options.width)})
+    return [canopy.sections for canopy in find_canopies(found, settings.model_copy(update={"sections": dense}))]
 
 
 def _corner(dtm: Raster) -> Origin:

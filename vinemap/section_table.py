@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
 import numpy as np
@@ -24,31 +24,58 @@ LOW, HIGH, TOP = 0.02, 0.98, 0.985
 """Quantiles of the canopy's points across the row, its sides, and of their heights, its top."""
 
 
-def measure_sections(
-    canopy: Sections,
-    bottom: Values,
-    polygons: Values,
-    foliage: Values,
-    indices: tuple[Values, Values, Values],
-    *,
-    crs: CRS,
-) -> gpd.GeoDataFrame:
-    """Table of sections, each as a line across the row on the ground.
+class Measures(NamedTuple):
+    """What is measured of m sections."""
 
-    Heights and widths come from quantiles of the points, never from the polygons' corners.
+    n_points: NDArray[np.int64]
+    height: Values
+    """98.5% height (m,) of the points above ground in metres."""
+    bottom: Values
+    """Height (m,) at which the foliage begins in metres."""
+    width: Values
+    """2–98% of the points across (m,) in metres."""
+    area: Values
+    """Of the foliage's outline (m,) in m²."""
+    good: Values
+    under: Values
+    over: Values
+    """G, U and O (m,) of Table 3.1."""
+    reduction: Values
+    """R (m,) of Table 3.1."""
+
+
+def measure_sections(canopy: Sections, bottom: Values, areas: tuple[Values, Values, Values], *, c: int) -> Measures:
+    """Measure sections, heights and widths by quantiles of their points, never by the polygons' corners.
 
     Parameters
     ----------
     canopy : Sections
-        Canopy points of every section.
+        Canopy points of m sections.
     bottom : (m,) array
         Height in metres at which the foliage begins.
+    areas : three (m,) arrays
+        In m²: of what the polygons and the foliage's outlines share, of the polygons, and of the outlines.
+    c : int
+        Vertices of a polygon.
+    """
+    y = canopy.points[:, 0]
+    width = quantile_of(y, canopy.start, HIGH) - quantile_of(y, canopy.start, LOW)
+    height = quantile_of(canopy.height, canopy.start, TOP)
+    reduction = complexity_reduction(canopy, c=c)
+    return Measures(np.diff(canopy.start), height, bottom, width, areas[2], *modelling_indices(*areas), reduction)
+
+
+def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs: CRS) -> gpd.GeoDataFrame:
+    """Table of sections, each as a line across the row on the ground, as wide as its polygon.
+
+    Parameters
+    ----------
+    at : Sections
+        m sections; their points don't matter.
     polygons : (m, c, 2) array
         c-gons in the sections' frames, in metres.
-    foliage : (m,) array
-        Areas of the foliage's outlines in m².
-    indices : three (m,) arrays
-        Good, under- and over-modelling (:func:`modelling_indices`).
+    measures : Measures
+        What was measured of them.
 
     Returns
     -------
@@ -58,26 +85,22 @@ def measure_sections(
         width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha`` = 2 (height − bottom) · 10,000 / spacing; Table 3.1's
         indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23).
     """
-    y = canopy.points[:, 0]
-    height = quantile_of(canopy.height, canopy.start, TOP)
-    width = quantile_of(y, canopy.start, HIGH) - quantile_of(y, canopy.start, LOW)
-    good, under, over = indices
-    reduction = complexity_reduction(canopy, c=polygons.shape[1])
-    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0]])
+    n_points, height, bottom, width, area, good, under, over, reduction = measures
+    normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
-    ends = canopy.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
-    level = np.repeat(canopy.origin[:, None, 2:], 2, axis=1)
+    ends = at.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
+    level = np.repeat(at.origin[:, None, 2:], 2, axis=1)
     return gpd.GeoDataFrame(
         {
-            "row_id": canopy.row_id,
-            "position_m": canopy.position,
+            "row_id": at.row_id,
+            "position_m": at.position,
             "height_m": height,
             "bottom_m": bottom,
             "width_m": width,
-            "area_m2": foliage,
-            "n_points": np.diff(canopy.start),
-            "trv_m3_ha": height * width * HECTARE / canopy.spacing,
-            "lwa_m2_ha": 2 * (height - bottom) * HECTARE / canopy.spacing,
+            "area_m2": area,
+            "n_points": n_points,
+            "trv_m3_ha": height * width * HECTARE / at.spacing,
+            "lwa_m2_ha": 2 * (height - bottom) * HECTARE / at.spacing,
             "good": good,
             "under": under,
             "over": over,

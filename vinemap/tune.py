@@ -89,7 +89,7 @@ def _model(found: RowMap, sections: dict[str, float], c: int, foot: str) -> Cano
 
 def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tuple[Values, NDArray[np.bool_]]:
     """Polygons (n, c, 2) of a model's mesh at the sections of the reference, and whether it has one there."""
-    mine, wanted = model.canopy, reference.canopy
+    mine, wanted = model.at, reference.at
     out = np.full((len(wanted.row_id), *model.polygons.shape[1:]), np.nan)
     for row_id in np.unique(mine.row_id):
         own, there = np.flatnonzero(mine.row_id == row_id), np.flatnonzero(wanted.row_id == row_id)
