@@ -1,30 +1,50 @@
-"""PDAL as an engine: its pipelines on a stand-in that works as PDAL does, and the error without it."""
+"""PDAL as an engine: its pipelines on a stand-in that works as PDAL does, the error without it, and PDAL itself."""
 
+import json
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
+import geopandas as gpd
 import laspy
 import numpy as np
 import pytest
+import rasterio
 import shapely
 from pyproj import CRS, Transformer
 
-from vinemap import pdal_engine
+from vinemap import paths, pdal_engine
+from vinemap.config import GroundOptions, Settings
 from vinemap.errors import DependencyError, InputError
+from vinemap.evaluate import evaluate_rows
+from vinemap.ground import terrain_model
 from vinemap.las import read_cloud
+from vinemap.parcel import map_parcel
 from vinemap.pdal_engine import ground_pipeline, read_cloud_pdal, reading_pipeline
+from vinemap.raster import sample
+from vinemap.synthetic import write_survey
+from vinemap.vector import read_boundary
 
+ROOT = Path(__file__).parents[1]
 UTM = CRS.from_epsg(32632)
 DEGREES = CRS.from_epsg(4326)
 SQUARE = shapely.box(414710, 4940710, 414730, 4940740)
+WITH_PDAL = Settings(ground=GroundOptions(engine="pdal"))
 USABLE = ("filters.expression", {"expression": "Classification != 7 && Classification != 18 && Withheld == 0"})
 
 
 def numbers(text):
     return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", text)]
+
+
+def inside(vineyard):
+    """Corners of the parcel, without its edge."""
+    west, south, east, north = vineyard.parcels.total_bounds
+    return (west + 2, south + 2), (east - 2, north - 2)
 
 
 class Stage:
@@ -284,18 +304,88 @@ def test_errors_of_pdal_are_one_line_with_the_files_name(pdal, tmp_path, points,
     )
 
 
+def test_a_parcel_with_pdal(pdal, tmp_path, vineyard, monkeypatch):
+    """Rows, terrain and record of a run in which the ground is what the simulation knows it to be."""
+    monkeypatch.setattr(Pipeline, "terrain", staticmethod(vineyard.terrain))
+    survey = write_survey(vineyard, tmp_path / "in")
+    boundary = survey.parent / "parcels.gpkg"
+    summary = map_parcel(survey, tmp_path / "out", parcel="A", boundary=boundary, settings=WITH_PDAL)
+    assert summary.rows == 6
+    found = evaluate_rows(gpd.read_file(paths.geopackage(summary.folder, "A"), layer="rows"), vineyard.rows)
+    assert (found.good, found.extra, found.missed) == (100, 0, 0)
+    assert found.dep.mean < 0.08
+    assert found.dek.mean < 0.02
+    with rasterio.open(paths.raster(summary.folder, "A", "dtm")) as dtm:
+        x, y = np.random.default_rng(0).uniform(*inside(vineyard), (3000, 2)).T
+        error = np.abs([z[0] for z in dtm.sample(zip(x, y, strict=True))] - vineyard.terrain(x, y))
+    assert np.median(error) < 0.02
+    assert np.quantile(error, 0.95) < 0.1
+    record = json.loads(paths.run_record(summary.folder).read_text())
+    assert record["settings"]["ground"]["engine"] == "pdal"
+    assert record["versions"]["pdal"] == "3.5.5"
+    assert record["versions"]["libpdal"] == "2.10.0"
+    assert {stage.type for pipeline in Pipeline.made for stage in pipeline.stages} >= {"readers.las", "filters.smrf"}
+
+
 def test_without_pdal(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pdal", None)
     for refused in (
         lambda: reading_pipeline(Path("a.laz"), source=UTM, target=UTM),
         lambda: read_cloud_pdal(tmp_path / "none.laz"),
+        lambda: map_parcel(tmp_path / "none.laz", tmp_path / "out", parcel="A", settings=WITH_PDAL),
     ):
         with pytest.raises(DependencyError, match="conda install -c conda-forge python-pdal"):
             refused()
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="no such file"):
+        map_parcel(tmp_path / "none.laz", tmp_path / "out", parcel="A")
 
 
 def test_with_a_pdal_that_lacks_what_is_used(pdal, monkeypatch):
     monkeypatch.delattr(pdal.Filter, "expression")
     with pytest.raises(DependencyError, match="expression"):
         pdal_engine.load_pdal()
+
+
+@pytest.mark.parametrize(
+    ("command", "settings"),
+    [
+        (["vinemap.cli", "run", "none.laz", "--settings", "s.yaml"], "ground: {engine: pdal}"),
+        (
+            ["flows.parcel", "s.yaml", "F"],
+            "{survey: barolo, simulate: barolo, parcels: [F], settings: {ground: {engine: pdal}}}",
+        ),
+    ],
+)
+def test_commands_without_pdal_end_at_once(tmp_path, command, settings):
+    """One line and exit code 2 before anything is read, simulated or written, even if somebody has PDAL."""
+    (tmp_path / "pdal.py").write_text("raise ImportError('libpdalcpp.so: cannot open shared object file')\n")
+    (tmp_path / "s.yaml").write_text(settings)
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
+    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-m", *command]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("vinemap: ground.engine: pdal")
+    assert done.stderr.count("\n") == 1
+    for word in ("libpdalcpp.so", "conda install -c conda-forge python-pdal", "leave ground.engine out"):
+        assert word in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} - {"prefect"} == {"pdal.py", "s.yaml"}
+
+
+def test_pdal_itself(tmp_path, vineyard):
+    try:
+        pdal_engine.load_pdal()
+    except DependencyError as error:
+        pytest.skip(str(error))
+    survey = write_survey(vineyard, tmp_path)
+    cloud = assert_same(survey, boundary=read_boundary(survey.parent / "parcels.gpkg"))
+    dtm = terrain_model(cloud, engine="pdal")
+    xy = np.random.default_rng(0).uniform(*inside(vineyard), (3000, 2))
+    error = np.abs(sample(dtm, xy) - vineyard.terrain(*xy.T))
+    assert np.median(error) < 0.02
+    assert np.quantile(error, 0.95) < 0.12
