@@ -19,6 +19,7 @@ from vinemap.config import SurveyConfig, choose_parcel, load_survey
 from vinemap.crs import parse_crs
 from vinemap.errors import ConfigError, InputError
 from vinemap.parcel import Summary, map_parcel
+from vinemap.pdal_engine import check_engine
 from vinemap.scenes import barolo
 from vinemap.synthetic import write_survey
 
@@ -81,6 +82,7 @@ def main() -> None:
             )
         config = load_survey(Path(sys.argv[1]))
         parcel = choose_parcel(config, sys.argv[2])
+        check_engine(config.settings.ground.engine)
         ensure_cloud(config)
         click.echo(parcel_flow(config.survey, parcel, config).line())
 

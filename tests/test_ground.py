@@ -5,6 +5,7 @@ import pytest
 
 from vinemap.cloud import PointCloud
 from vinemap.crs import parse_crs
+from vinemap.errors import InputError
 from vinemap.ground import canopy_height_model, terrain_model
 from vinemap.raster import sample
 from vinemap.scenes import hillside, rows_of, terraced
@@ -94,3 +95,26 @@ def test_a_handful_of_points():
     dtm = terrain_model(PointCloud(xyz, UTM))
     assert np.isfinite(dtm.values).all()
     assert np.abs(dtm.values - 5.1).max() < 1
+
+
+def test_classified_points_make_the_terrain_and_bridge_what_has_none():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, [[40], [30]], (2, 200_000))
+    ground = 0.3 * x + 0.002 * (y - 10) ** 2
+    z = ground + rng.normal(0, 0.02, len(x))
+    classes = np.full(len(x), 2, dtype=np.uint8)
+    hidden = np.hypot(x - 25, y - 15) < 4
+    wrong = rng.random(len(x)) < 0.02
+    z[hidden | wrong] += 2
+    classes[hidden] = 1
+    cloud = PointCloud(np.column_stack([x, y, z]), UTM, classification=classes)
+    error = sample(terrain_model(cloud, engine="pdal"), cloud.xyz) - ground
+    inner = (np.abs(x - 20) < 18) & (np.abs(y - 15) < 13)
+    assert np.quantile(np.abs(error[inner]), 0.95) < 0.06
+    assert np.abs(error[hidden]).max() < 0.1
+
+
+def test_clouds_without_ground_say_so(cloud):
+    for classes in (None, np.ones(len(cloud.xyz), dtype=np.uint8)):
+        with pytest.raises(InputError, match="classified as ground"):
+            terrain_model(PointCloud(cloud.xyz, cloud.crs, classification=classes), engine="pdal")

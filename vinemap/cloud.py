@@ -30,6 +30,7 @@ class PointCloud:
 
     ``vertical`` names the vertical datum that the file states; heights are never moved to another. ``heights`` (n,)
     are metres above the terrain model, once there is one; ``first`` is the index of its first point in a larger cloud.
+    ``classification`` (n,) holds ASPRS classes, where the engine that read the points gives them.
     """
 
     xyz: NDArray[np.float64]
@@ -37,6 +38,7 @@ class PointCloud:
     vertical: str | None = None
     heights: NDArray[np.floating] = field(default_factory=lambda: np.empty(0, dtype=np.float32))
     first: int = 0
+    classification: NDArray[np.uint8] | None = None
     _bins: list[Bins] = field(default_factory=list, repr=False, compare=False)
 
     @property

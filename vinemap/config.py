@@ -34,6 +34,7 @@ class Options(BaseModel):
 class GroundOptions(Options):
     """Terrain model."""
 
+    engine: Literal["vinemap", "pdal"] = Field("vinemap", description="ours, or PDAL's readers and its SMRF")
     resolution: float = Field(0.25, ge=0.05, le=2, description="cell size of the DTM (m)")
     quantile: float = Field(0.1, gt=0, le=0.5, description="order of the height that stands for a cell's terrain")
     tolerance: Metres = Field(0.12, description="height above the surface around it at which a cell is terrain (m)")

@@ -16,7 +16,8 @@ from scipy.special import ndtr, ndtri
 
 from vinemap.bins import quantiles_in
 from vinemap.compiled import in_threads
-from vinemap.raster import Grid, Raster, above, block_sum, coarser, grid_over, sample, window
+from vinemap.errors import InputError
+from vinemap.raster import Grid, Raster, above, block_sum, cell_of, coarser, grid_over, sample, window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.float64]
 
+GROUND = 2
+"""ASPRS class of ground."""
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
 EVEN = 0.02
@@ -57,13 +60,14 @@ def terrain_model(
     quantile: float = 0.1,
     tolerance: float = 0.12,
     terrace_height: float = 1.0,
+    engine: str = "vinemap",
 ) -> Raster:
     """Digital terrain model of a cloud, without holes.
 
     Parameters
     ----------
     cloud : PointCloud or TiledCloud
-        Points of terrain, vegetation and whatever stands on it; no classes needed.
+        Points of terrain, vegetation and whatever stands on it; no classes needed, but by the engine "pdal".
     resolution : float
         Cell size in metres.
     quantile : float
@@ -72,12 +76,17 @@ def terrain_model(
         Metres that a cell may stand above the surface around it and still count as terrain.
     terrace_height : float
         Metres up to which a raised thin layer counts as a terrace; 0 where there are none.
+    engine : str
+        "vinemap", or "pdal": the surface through the points that PDAL classified as ground, for which of all
+        these only ``resolution`` counts.
 
     Returns
     -------
     Raster
         Elevations in metres (ny, nx).
     """
+    if engine == "pdal":
+        return classified_terrain(cloud, resolution=resolution)
     blocks = max(1, round(COARSE / resolution))
     grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
     wide = coarser(grid, resolution=blocks * resolution)
@@ -93,6 +102,39 @@ def terrain_model(
         if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
             break
     return surface
+
+
+def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
+    """Digital terrain model through the points of a cloud that are classified as ground, without holes.
+
+    Local planes are fitted to the cells' mean heights from coarse to fine, and bridge the cells that have none.
+
+    Raises
+    ------
+    InputError
+        If no point is classified as ground.
+    """
+    low, high = cloud.extent
+    grid = grid_over(low, high, resolution=resolution, multiple=max(1, round(COARSE / resolution)))
+    reference = float(np.round((low[2] + high[2]) / 2))
+    n, total = np.zeros((2, grid.ny * grid.nx))
+    for part in cloud.parts():
+        if part.classification is not None:
+            ground = part.xyz[part.classification == GROUND]
+            cell = cell_of(ground, grid)
+            n += np.bincount(cell, minlength=len(n))
+            total += np.bincount(cell, ground[:, 2] - reference, minlength=len(n))
+    if not n.any():
+        raise InputError("no point of the cloud is classified as ground: leave out ground.engine")
+    held = n.reshape(grid.shape) > 0
+    level = (total / np.maximum(n, 1)).reshape(grid.shape)
+    plain = weight = np.minimum(n, 15.0).reshape(grid.shape)
+    surface = _trend(level, held)
+    for reach in (1.5, 1.5, 0.6, 0.3):
+        surface = surface + _multiscale(level - surface, weight, reach / resolution)
+        off = np.abs(level - surface)
+        weight = plain / (1 + (off / (0.05 + 2 * np.median(off[held]))) ** 2)
+    return Raster(surface + reference, grid, cloud.crs)
 
 
 def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Values:

@@ -30,6 +30,7 @@ from vinemap.ground import canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
+from vinemap.pdal_engine import check_engine, pdal_versions, read_cloud_pdal
 from vinemap.product import fingerprint, labelled, parcel_layer, write_product
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
@@ -175,6 +176,8 @@ def map_parcel(
     """
     parcel = check_name(parcel)
     settings = settings or Settings()
+    with_pdal = settings.ground.engine == "pdal"
+    check_engine(settings.ground.engine)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
 
@@ -187,7 +190,7 @@ def map_parcel(
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
-        points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon)
+        points = run("Reading", read_cloud_pdal if with_pdal else read_cloud, cloud, crs=crs, boundary=polygon)
         if origin and np.abs(to_main(points.xyz[:1], points.crs, origin)[0, :2]).max() > FARTHEST:
             raise InputError(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
@@ -235,7 +238,9 @@ def map_parcel(
             "counts": counts,
             "modelling": modelling.to_dict() if len(model.table) else None,
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
-            "versions": {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES},
+            "versions": {"python": platform.python_version()}
+            | {name: version(name) for name in LIBRARIES}
+            | (pdal_versions() if with_pdal else {}),
             "files": sorted(path.name for path in draft.iterdir()),
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
