@@ -61,7 +61,7 @@ def test_a_cloud_without_canopy(cloud):
 def test_file_read_back(classified, tmp_path):
     flown, found, classes, row_id = classified
     path = tmp_path / "classified.laz"
-    write_classified(found.cloud, classes, row_id, path)
+    write_classified(found.cloud, lambda part: (classes, row_id), path)
     back = laspy.read(path)
     assert np.abs(back.xyz - flown.xyz).max() < 0.001
     assert (np.asarray(back.classification) == classes).all()

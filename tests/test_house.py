@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
 BASE = {"errors", "crs", "compiled"}
-DATA = {"cloud", "raster", "vector", "mesh", "row_frame", "zones", "bins", "las", "tiles", "pdal_engine"}
+DATA = {"cloud", "raster", "vector", "mesh", "row_frame", "zones", "bins", "las", "pieces", "tiles", "pdal_engine"}
 STAGES = {
     "ground",
     "cover",

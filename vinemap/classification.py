@@ -34,7 +34,7 @@ def classify_points(
     Parameters
     ----------
     cloud : PointCloud
-        n points with their heights above ground.
+        n points with their heights above ground, the whole cloud's or a part's.
     leaves : sequence of Sections
         Canopy points of the rows' sections.
     ground : float
@@ -52,18 +52,19 @@ def classify_points(
         Row of the canopy's points, 0 for all others.
     """
     heights = cloud.heights
-    classes = np.full(len(heights), OTHER, dtype=np.uint8)
+    row_id = np.zeros(cloud.size, dtype=np.uint16)
+    for sections in leaves:
+        mine = sections.member - cloud.first
+        inside = (mine >= 0) & (mine < cloud.size)
+        row_id[mine[inside]] = np.repeat(sections.row_id, np.diff(sections.start))[inside]
+    canopy = row_id > 0
+    classes = np.full(cloud.size, OTHER, dtype=np.uint8)
     classes[np.abs(heights) <= ground] = GROUND
     aloft = np.flatnonzero(np.abs(heights) > air)
-    canopy = np.zeros(len(heights), dtype=bool)
-    row_id = np.zeros(len(heights), dtype=np.uint16)
-    for sections in leaves:
-        canopy[sections.member] = True
-        row_id[sections.member] = np.repeat(sections.row_id, np.diff(sections.start))
     lone = aloft[~canopy[aloft]]
     if len(lone):
         (west, south, _), (east, north, _) = cloud.extent
-        density = len(heights) / max((east - west) * (north - south), 1.0)
+        density = cloud.size / max((east - west) * (north - south), 1.0)
         near = reach * max(1.0, (100 / density) ** 0.5)
         distance, _ = cKDTree(cloud.xyz[aloft]).query(cloud.xyz[lone], COMPANIONS + 1, workers=-1)
         classes[lone[distance[:, -1] > near]] = NOISE

@@ -31,6 +31,14 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class ReadingOptions(Options):
+    """Points in memory."""
+
+    max_points: int | None = Field(
+        None, ge=1000, description="points held in memory, more are worked in tiles; none: what half of it holds"
+    )
+
+
 class GroundOptions(Options):
     """Terrain model."""
 
@@ -169,6 +177,7 @@ class ProductOptions(Options):
 class Settings(Options):
     """Settings of every stage."""
 
+    reading: ReadingOptions = ReadingOptions()
     ground: GroundOptions = GroundOptions()
     cover: CoverOptions = CoverOptions()
     row_field: RowFieldOptions = RowFieldOptions()

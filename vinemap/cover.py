@@ -13,8 +13,9 @@ from vinemap.raster import Raster, block_sum, cell_of, grid_over, window
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Cloud, PointCloud
+    from vinemap.cloud import PointCloud
     from vinemap.raster import Grid
+    from vinemap.tiles import Cloud
 
     Values = NDArray[np.floating]
 

@@ -22,7 +22,7 @@ from vinemap.raster import Grid, Raster, above, block_sum, cell_of, coarser, gri
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Cloud
+    from vinemap.tiles import Cloud
 
     Values = NDArray[np.float64]
 
@@ -102,6 +102,12 @@ def terrain_model(
         if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
             break
     return surface
+
+
+def tile_side(resolution: float) -> float:
+    """Side in metres, about 64, of tiles of a cloud whose edges are those of the terrain model's blocks of cells."""
+    block = max(1, round(COARSE / resolution)) * resolution
+    return max(1, round(64 / block)) * block
 
 
 def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:

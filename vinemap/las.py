@@ -2,39 +2,51 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
 
-from vinemap.cloud import PointCloud
 from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 from vinemap.errors import InputError
-from vinemap.raster import extent
+from vinemap.tiles import Collector
 from vinemap.zones import deal, zones_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    import shapely
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.zones import Zones
+    from vinemap.cloud import PointCloud
+    from vinemap.tiles import Cloud
 
-CHUNK = 1_000_000
+    Points = NDArray[np.float64]
+    Box = tuple[Points, Points]
+
+CHUNK = 500_000
+"""Points that are decompressed at once."""
+SMALL = 0.25
+"""Share of a COPC file's extent up to which a query by box is faster than reading it through."""
 LARGEST_RELIEF = 2_000.0
 """Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
 
-Boundary = tuple["shapely.Geometry", "CRS"]
+Boundary = tuple[shapely.Geometry, "CRS"]
 """A polygon and its CRS."""
 
 
-def read_cloud(path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None) -> PointCloud:
+def read_cloud(
+    path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None, collector: Collector | None = None
+) -> Cloud:
     """Read a LAS, LAZ or COPC file in chunks into a metric projected CRS, clipped to a polygon.
 
-    Points flagged as withheld and points of ASPRS class 7 or 18 (noise) are left out.
+    Points flagged as withheld and points of ASPRS class 7 or 18 (noise) are left out. Of a COPC file only what lies
+    about the polygon is read.
 
     Parameters
     ----------
@@ -44,31 +56,76 @@ def read_cloud(path: Path, *, crs: CRS | None = None, boundary: Boundary | None 
         CRS of the file's coordinates; needed where the file states none, and preferred to what it states.
     boundary : (Geometry, CRS), optional
         Polygon to clip to.
+    collector : Collector, optional
+        Takes the points; by default in memory.
 
     Raises
     ------
     InputError
         If the file can't be read whole, has no points, no CRS, or coordinates that can't be right.
     """
+    points = collector or Collector()
+    with open_cloud(path, crs=crs, around=boundary) as (target, vertical, chunks):
+        zones = zones_of([boundary_in(boundary, target, path)]) if boundary else None
+        for xyz in chunks:
+            points.add(deal(xyz, zones)[0] if zones else xyz)
+    return collected(points, target, vertical, path)
+
+
+def collected(points: Collector, crs: CRS, vertical: str | None, path: Path) -> Cloud:
+    """The cloud that was collected from a file, without the few points that lie absurdly far from the rest.
+
+    Raises
+    ------
+    InputError
+        If there are no points, or no survey could have them.
+    """
+    if points.size == 0:
+        raise InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
+    return points.cloud(crs, vertical, *_plausible(points.sample(100_000), path))
+
+
+@contextmanager
+def open_cloud(
+    path: Path, *, crs: CRS | None = None, around: Boundary | None = None
+) -> Iterator[tuple[CRS, str | None, Iterator[Points]]]:
+    """Open a LAS, LAZ or COPC file: gives its metric projected CRS, its vertical datum, and chunks of points (n, 3).
+
+    Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
+    :func:`read_cloud`.
+    """
     import laspy  # 0.4 s of start-up
 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed()) as reader:
-            header = reader.header
-            source = crs or _stated_crs(header, path)
-            _check_header(header, source, path)
-            return _read(reader, source, boundary, path)
-    except InputError:
-        raise
+        reader = laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed())
     except Exception as error:  # laspy and lazrs raise many kinds, a Rust panic among them
-        reason = str(error).strip().split("\n")[0] or type(error).__name__
-        raise InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?") from error
+        raise _unreadable(path, error) from error
+    with reader:
+        source = crs or _stated_crs(reader.header, path)
+        _check_header(reader.header, source, path)
+        chunks = _usable_chunks(reader, source, path, around)
+        first = next(chunks, None)
+        if first is None:
+            raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+        target = metric_crs(source, *np.median(first[:, :2], axis=0))
+        yield target, vertical_name(source), (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
 
 
-def write_classified(cloud: PointCloud, classes: NDArray[np.uint8], row_id: NDArray[np.uint16], path: Path) -> None:
+def write_classified(
+    cloud: Cloud, classify: Callable[[PointCloud], tuple[NDArray[np.uint8], NDArray[np.uint16]]], path: Path
+) -> None:
     """Write a LAZ file (LAS 1.4) of points with ``Classification``, ``HeightAboveGround`` (m) and ``row_id``.
+
+    Parameters
+    ----------
+    cloud : PointCloud or TiledCloud
+        Points with their heights above ground.
+    classify : callable
+        Gives the class and the row (n,) of every point of a part of the cloud.
+    path : Path
+        The file.
 
     Raises
     ------
@@ -79,7 +136,7 @@ def write_classified(cloud: PointCloud, classes: NDArray[np.uint8], row_id: NDAr
 
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales = np.full(3, 0.001)
-    header.offsets = np.floor(cloud.xyz.min(axis=0))
+    header.offsets = np.floor(cloud.extent[0])
     header.add_crs(cloud.crs)
     header.add_extra_dims(
         [
@@ -87,13 +144,14 @@ def write_classified(cloud: PointCloud, classes: NDArray[np.uint8], row_id: NDAr
             laspy.ExtraBytesParams("row_id", "uint16", "vine row, 0 for none"),
         ]
     )
-    out = laspy.LasData(header)
-    out.x, out.y, out.z = cloud.xyz.T
-    out.classification = classes
-    out["HeightAboveGround"] = cloud.heights
-    out["row_id"] = row_id
-    with path.open("wb") as stream:
-        out.write(stream, do_compress=True, laz_backend=laspy.LazBackend.LazrsParallel)
+    backend = laspy.LazBackend.LazrsParallel
+    with laspy.open(path, mode="w", header=header, do_compress=True, laz_backend=backend) as writer:
+        for part in cloud.parts():
+            points = laspy.ScaleAwarePointRecord.zeros(part.size, header=header)
+            points.x, points.y, points.z = part.xyz.T
+            points["classification"], points["row_id"] = classify(part)
+            points["HeightAboveGround"] = part.heights
+            writer.write_points(points)
 
 
 def _backends(path: Path) -> Any:
@@ -137,34 +195,50 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
         )
 
 
-def _read(reader: Any, source: CRS, boundary: Boundary | None, path: Path) -> PointCloud:
-    total = reader.header.point_count
-    xyz = np.empty((0, 3))
-    done = n = 0
-    target: CRS | None = None
-    zones: Zones | None = None
-    for chunk in reader.chunk_iterator(CHUNK):
-        done += len(chunk)
-        part = _usable(chunk)
-        if len(part) == 0:
-            continue
-        if target is None:
-            target = metric_crs(source, *np.median(part[:, :2], axis=0))
-            zones = zones_of([_boundary_in(boundary, target, path)]) if boundary else None
-        part = _to_metric(part, source, target)
-        if zones:
-            part = deal(part, zones)[0]
-        # Grown in place: a list of chunks joined at the end would take twice the memory.
-        xyz.resize((n + len(part), 3), refcheck=False)
-        xyz[n:] = part
-        n += len(part)
+def _usable_chunks(reader: Any, source: CRS, path: Path, around: Boundary | None) -> Iterator[Points]:
+    """Coordinates (n, 3) of a file's usable points, in its own CRS, chunk by chunk."""
+    box = _small_box(reader.header, source, around) if around else None
+    found = _query(path, box) if box else None
+    total, done = reader.header.point_count if found is None else len(found), 0
+    try:
+        for chunk in reader.chunk_iterator(CHUNK) if found is None else [found]:
+            done += len(chunk)
+            xyz = _usable(chunk)
+            if len(xyz):
+                yield xyz
+    except InputError:
+        raise
+    except Exception as error:
+        raise _unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
-    if target is None:
-        raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
-    if n == 0:
-        raise InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
-    return PointCloud(_without_strays(xyz, path), target, vertical=vertical_name(source))
+
+
+def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
+    """Least and greatest x and y of a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
+    if not any(record.user_id == "copc" for record in header.vlrs):
+        return None
+    west, south, east, north = shapely.bounds(project(*around, horizontal(source))).tolist()
+    margin = 0.01 * max(east - west, north - south)
+    low, high = np.array([west, south]) - margin, np.array([east, north]) + margin
+    whole = np.prod(header.maxs[:2] - header.mins[:2])
+    return (low, high) if np.prod(high - low) < SMALL * whole else None
+
+
+def _query(path: Path, box: Box) -> Any | None:
+    """Points of a COPC file in a box; None where its index can't be read."""
+    from laspy.copc import Bounds, CopcReader
+
+    try:
+        with path.open("rb") as stream:
+            return CopcReader(stream, decompression_selection=_needed()).query(bounds=Bounds(*box))
+    except Exception:  # laspy and lazrs raise many kinds: the file may still be read through
+        return None
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    reason = str(error).strip().split("\n")[0] or type(error).__name__
+    return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
 
 def _usable(chunk: Any) -> NDArray[np.float64]:
@@ -188,18 +262,26 @@ def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np
     return xyz
 
 
-def _boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
-    import shapely
+def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
+    """A boundary's polygon in the CRS to which a file is brought.
 
+    Raises
+    ------
+    InputError
+        If it can't be brought there.
+    """
     polygon = project(*boundary, target)
     if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
     return polygon
 
 
-def _without_strays(xyz: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """Drop the few points that lie absurdly far from the rest, which would stretch every raster."""
-    low, high = np.quantile(xyz[:: max(1, len(xyz) // 100_000)], [0.002, 0.998], axis=0)
+def _plausible(sample: Points, path: Path) -> tuple[Points, Points]:
+    """Corners (3,) beyond which a survey, of whose points there is a sample (n, 3), has only strays.
+
+    Strays are few, but would stretch every raster.
+    """
+    low, high = np.quantile(sample, [0.002, 0.998], axis=0)
     span = high - low
     if span[2] > LARGEST_RELIEF:
         raise InputError(f"{path}: heights span {span[2]:.0f} m, which is no survey: check scale, offset and units")
@@ -208,7 +290,4 @@ def _without_strays(xyz: NDArray[np.float64], path: Path) -> NDArray[np.float64]
             f"{path}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check scale, offset and CRS"
         )
     reach = 0.5 * span + [50.0, 50.0, 100.0]
-    lowest, highest = extent(xyz)
-    if (lowest < low - reach).any() or (highest > high + reach).any():
-        xyz = xyz[((xyz >= low - reach) & (xyz <= high + reach)).all(axis=1)]
-    return xyz
+    return low - reach, high + reach

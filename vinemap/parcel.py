@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
+import shutil
 import time
 from datetime import UTC, datetime
 from functools import partial
@@ -26,17 +28,19 @@ from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
 from vinemap.errors import InputError
-from vinemap.ground import canopy_height_model, terrain_model
+from vinemap.ground import canopy_height_model, terrain_model, tile_side
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
 from vinemap.pdal_engine import check_engine, pdal_versions, read_cloud_pdal
+from vinemap.pieces import read_piece
 from vinemap.product import fingerprint, labelled, parcel_layer, write_product
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.section_table import Measures, measure_sections, summarise_rows, tabulate_sections
 from vinemap.sections import cut_sections
+from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
 
 if TYPE_CHECKING:
@@ -48,11 +52,15 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.canopy import Canopy
-    from vinemap.cloud import Cloud, Sections
+    from vinemap.cloud import Sections
+    from vinemap.pieces import Piece
     from vinemap.raster import Raster, RowField
+    from vinemap.tiles import Cloud
 
 T = TypeVar("T")
 
+BYTES_A_POINT = 60
+"""Memory that a run takes."""
 FARTHEST = 50_000.0
 """Metres from the origin of {Main}, a plane that the globe leaves by then."""
 
@@ -144,6 +152,8 @@ def map_parcel(
     boundary: Path | None = None,
     crs: CRS | None = None,
     origin: Origin | None = None,
+    piece: Piece | None = None,
+    inputs: Sequence[dict[str, Any]] = (),
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Map the rows and canopies of one parcel, and leave the product in a folder.
@@ -166,6 +176,10 @@ def map_parcel(
         CRS of the cloud's coordinates, where the file states none or a wrong one.
     origin : Origin, optional
         Origin of {Main}; by default the south-western corner of the parcel at its lowest terrain.
+    piece : Piece, optional
+        The parcel's points, where the cloud was read before.
+    inputs : sequence of dict, optional
+        Fingerprints of cloud and boundary, where they are known.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -188,10 +202,22 @@ def map_parcel(
         return out
 
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
-    inputs = [fingerprint(path) for path in (cloud, boundary) if path]
+    inputs = inputs or [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
-        points = run("Reading", read_cloud_pdal if with_pdal else read_cloud, cloud, crs=crs, boundary=polygon)
-        if origin and np.abs(to_main(points.xyz[:1], points.crs, origin)[0, :2]).max() > FARTHEST:
+        paths.tiles(draft).mkdir()
+        collector = Collector(
+            paths.tiles(draft),
+            most=settings.reading.max_points or _most_points(),
+            side=tile_side(settings.ground.resolution),
+        )
+        points: Cloud
+        if with_pdal:
+            points = run("Reading", read_cloud_pdal, cloud, crs=crs, boundary=polygon)
+        elif piece:
+            points = run("Reading", read_piece, piece, collector)
+        else:
+            points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon, collector=collector)
+        if origin and np.abs(to_main(points.extent[0][None], points.crs, origin)[0, :2]).max() > FARTHEST:
             raise InputError(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
             )
@@ -219,10 +245,11 @@ def map_parcel(
             plain = settings.product.plain
             write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, plain=plain)
             if settings.product.classified:
-                classes = classify_points(found.cloud, _leaves(found, settings))
-                write_classified(found.cloud, *classes, paths.classified_cloud(draft, parcel))
+                classify = partial(classify_points, leaves=_leaves(found, settings))
+                write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
+        shutil.rmtree(paths.tiles(draft))
         counts = {"points": points.size, "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
@@ -316,6 +343,15 @@ def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
     options = settings.sections
     dense = options.model_copy(update={"step": min(options.step, options.width)})
     return [canopy.sections for canopy in find_canopies(found, settings.model_copy(update={"sections": dense}))]
+
+
+def _most_points() -> int:
+    """Points that half of the memory holds."""
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):  # not on Windows
+        memory = 8 << 30
+    return int(memory / 2 / BYTES_A_POINT)
 
 
 def _corner(dtm: Raster) -> Origin:

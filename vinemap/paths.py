@@ -59,6 +59,11 @@ def classified_cloud(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_classified.laz"
 
 
+def tiles(folder: Path) -> Path:
+    """Folder for the tiles of a cloud too large for memory, gone when the product is whole."""
+    return folder / "tiles"
+
+
 def run_record(folder: Path) -> Path:
     """Record of the run that made a product."""
     return folder / RUN

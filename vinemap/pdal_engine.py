@@ -14,7 +14,8 @@ import shapely
 from vinemap.cloud import PointCloud
 from vinemap.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
 from vinemap.errors import DependencyError, InputError
-from vinemap.las import _backends, _boundary_in, _check_header, _needed, _stated_crs, _without_strays
+from vinemap.las import _backends, _check_header, _needed, _stated_crs, _unreadable, boundary_in, collected
+from vinemap.tiles import Collector
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -98,18 +99,20 @@ def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | 
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     source, target, copc = _look_into(path, crs)
-    polygon = _boundary_in(boundary, target, path) if boundary else None
+    polygon = boundary_in(boundary, target, path) if boundary else None
     reading = reading_pipeline(path, source=source, target=target, polygon=polygon, copc=copc)
     xyz = _coordinates(_run(reading, path))
     del reading  # it holds every point with all its dimensions
-    if len(xyz) == 0 and boundary:
-        raise InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
-    if len(xyz) == 0:
+    if len(xyz) == 0 and not boundary:
         raise InputError(f"{path}: holds no usable points (all are flagged as noise)")
     xyz[:, 2] *= vertical_unit(source)
-    points = _run(ground_pipeline(_without_strays(xyz, path)), path)
+    collector = Collector()
+    collector.add(xyz)
+    vertical = vertical_name(source)
+    (cloud,) = collected(collector, target, vertical, path).parts()
+    points = _run(ground_pipeline(cloud.xyz), path)
     classes = points["Classification"].astype(np.uint8)
-    return PointCloud(_coordinates(points), target, vertical=vertical_name(source), classification=classes)
+    return PointCloud(_coordinates(points), target, vertical=vertical, classification=classes)
 
 
 def reading_pipeline(
@@ -214,11 +217,6 @@ def _run(pipeline: Any, path: Path) -> NDArray[np.void]:
         raise _unreadable(path, error) from error
     parts: NDArray[np.void] = np.concatenate(pipeline.arrays)
     return parts
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    reason = str(error).strip().split("\n")[0] or type(error).__name__
-    return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
 
 def _coordinates(points: NDArray[np.void]) -> NDArray[np.float64]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud import Cloud
+    from vinemap.tiles import Cloud
 
     Boundary = tuple[shapely.Geometry, CRS]
 

@@ -35,9 +35,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Cloud, PointCloud
+    from vinemap.cloud import PointCloud
     from vinemap.raster import Grid
     from vinemap.row_frame import Taken
+    from vinemap.tiles import Cloud
 
     Values = NDArray[np.floating]
 

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Cloud, PointCloud
+    from vinemap.cloud import PointCloud
     from vinemap.raster import Grid
+    from vinemap.tiles import Cloud
 
     Values = NDArray[np.floating]
 
@@ -69,12 +70,13 @@ def points_of_rows(
     """Refer a cloud's points within ``reach`` (rows,) metres of their nearest curve (k, 2) to it.
 
     Yields rows (a,), the frame's coordinates of their points row by row, and for each point what ``take`` tells of a
-    part of the cloud and its members: arrays (n,). A cloud in memory is done at once, one in tiles by groups of rows.
+    part of the cloud and its members: arrays (n,). Group by group of rows, so that
+    they don't take the memory of another cloud.
     """
     if not curves:
         return
-    lookup = _lookup(curves, reach)
     for rows in cloud.groups(curves):
+        lookup = _lookup(curves, reach, rows)
         within = np.full(len(curves), -1.0)
         within[rows] = reach[rows]
         found = []
@@ -86,7 +88,7 @@ def points_of_rows(
 
 def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> RowCoordinates:
     """Refer the points (n, ≥2) within ``reach`` (rows,) metres of their nearest curve (k, 2) to it."""
-    return _coordinates(xyz, _lookup(curves, reach), reach.astype(float))
+    return _coordinates(xyz, _lookup(curves, reach, np.arange(len(curves))), reach.astype(float))
 
 
 def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int64]) -> tuple[RowCoordinates, Taken]:
@@ -102,7 +104,8 @@ def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int6
     return RowCoordinates(start, *columns[:3]), tuple(columns[3:])
 
 
-def _lookup(curves: Sequence[Values], reach: Values) -> _Lookup:
+def _lookup(curves: Sequence[Values], reach: Values, rows: NDArray[np.int64]) -> _Lookup:
+    """Guides of all curves, and the nearest ones about some of the rows."""
     lengths = [float(way_along(curve)[-1]) for curve in curves]
     positions = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
     guides = _Guides(
@@ -112,7 +115,8 @@ def _lookup(curves: Sequence[Values], reach: Values) -> _Lookup:
         np.concatenate([tangents(curve, g) for curve, g in zip(curves, positions, strict=True)]),
     )
     widest = float(reach.max()) + GUIDE
-    grid = grid_over(guides.xy.min(axis=0) - widest, guides.xy.max(axis=0) + widest, resolution=GUIDE)
+    about = np.concatenate([curves[k] for k in rows])
+    grid = grid_over(about.min(axis=0) - widest, about.max(axis=0) + widest, resolution=GUIDE)
     return _Lookup(grid, _nearest_guides(guides.xy, grid, widest), guides)
 
 

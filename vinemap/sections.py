@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Cloud, PointCloud
+    from vinemap.cloud import PointCloud
     from vinemap.raster import Raster
     from vinemap.row_frame import Taken
+    from vinemap.tiles import Cloud
 
     Values = NDArray[np.floating]
 

@@ -1,0 +1,79 @@
+"""A survey read once: the points of each of its parcels, in a file of their own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vinemap.las import boundary_in, collected, open_cloud
+from vinemap.zones import deal, zones_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from pyproj import CRS
+
+    from vinemap.las import Boundary
+    from vinemap.tiles import Cloud, Collector
+
+CHUNK = 1_000_000
+"""Points that are read back at once."""
+
+
+class Piece(NamedTuple):
+    """Points (n, 3) in a file of float64, and of which cloud, and in which CRS and vertical datum, they are."""
+
+    path: Path
+    cloud: Path
+    crs: CRS
+    vertical: str | None
+
+
+def split_cloud(cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None) -> list[Piece]:
+    """Read a LAS, LAZ or COPC file once, and give every polygon its points; in several polygons' they go to each.
+
+    Parameters
+    ----------
+    cloud : Path
+        The file.
+    boundaries : sequence of (Geometry, CRS)
+        Polygons.
+    folder : Path
+        Where the files go, 24 bytes a point.
+    crs : CRS, optional
+        CRS of the file's coordinates, where it states none or a wrong one.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, as in :func:`vinemap.las.read_cloud`.
+    OSError
+        If the folder is full.
+    """
+    with open_cloud(cloud, crs=crs) as (target, vertical, chunks):
+        zones = zones_of([boundary_in(boundary, target, cloud) for boundary in boundaries])
+        pieces = [Piece(folder / f"{k}.xyz", cloud, target, vertical) for k in range(len(boundaries))]
+        for piece in pieces:
+            piece.path.touch()
+        for chunk in chunks:
+            xyz, start = deal(chunk, zones)
+            for k in np.flatnonzero(np.diff(start)):
+                with pieces[k].path.open("ab") as stream:
+                    xyz[start[k] : start[k + 1]].tofile(stream)
+    return pieces
+
+
+def read_piece(piece: Piece, collector: Collector) -> Cloud:
+    """The cloud of a piece, as if it had been read from the whole file.
+
+    Raises
+    ------
+    InputError
+        If it has no points, or no survey could have them.
+    """
+    with piece.path.open("rb") as stream:
+        while len(xyz := np.fromfile(stream, count=3 * CHUNK).reshape(-1, 3)):
+            collector.add(xyz)
+    return collected(collector, piece.crs, piece.vertical, piece.cloud)

@@ -1,0 +1,149 @@
+"""Clouds too large for memory: tiles on disk, worked one after the other with the same result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import shapely
+
+from vinemap.bins import bin_points
+from vinemap.cloud import PointCloud, row_groups
+from vinemap.raster import extent, grid_over
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+    from pyproj import CRS
+
+    from vinemap.raster import Raster
+
+    Points = NDArray[np.float64]
+
+CHUNK = 1_000_000
+"""Points that are moved to tiles at once."""
+
+
+class Tile(NamedTuple):
+    """A file of points (n, 3) as float64, their extent, and the index of the first in the cloud."""
+
+    path: Path
+    low: Points
+    high: Points
+    size: int
+    first: int = 0
+
+
+@dataclass(frozen=True)
+class TiledCloud:
+    """Points in tiles on disk: parts of a cloud, used as a :class:`vinemap.cloud.PointCloud` is.
+
+    The edges of tiles are those of the rasters' cells, so that statistics of cells are the same as of the cloud whole.
+    """
+
+    tiles: Sequence[Tile]
+    crs: CRS
+    vertical: str | None = None
+    dtm: Raster | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return sum(tile.size for tile in self.tiles)
+
+    @property
+    def extent(self) -> tuple[Points, Points]:
+        """Least and greatest coordinates (3,)."""
+        low, high = (np.array([tile[k] for tile in self.tiles]) for k in (1, 2))
+        return low.min(axis=0), high.max(axis=0)
+
+    def parts(self, near: shapely.Geometry | None = None) -> Iterator[PointCloud]:
+        """The cloud in parts that fit in memory, those near a geometry at the least."""
+        for tile in self.tiles:
+            box = shapely.box(*tile.low[:2], *tile.high[:2])
+            if near is None or shapely.intersects(box, near):
+                part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
+                yield part.above(self.dtm) if self.dtm else part
+
+    def groups(self, rows: Sequence[NDArray[np.floating]]) -> list[NDArray[np.int64]]:
+        """Indices of rows, as curves, whose points fit in memory together."""
+        return row_groups(rows, self.size)
+
+    def forget(self) -> None:
+        """Nothing is kept for speed."""
+
+    def above(self, dtm: Raster) -> TiledCloud:
+        """The cloud with its heights above a terrain model."""
+        return replace(self, dtm=dtm)
+
+
+Cloud = PointCloud | TiledCloud
+
+
+class Collector:
+    """Takes points chunk by chunk: in memory up to a number of them, in tiles in a folder beyond it."""
+
+    def __init__(self, folder: Path | None = None, *, most: float = np.inf, side: float = 64.0) -> None:
+        """Without a folder all stay in memory; ``side`` is that of a tile in metres."""
+        self.folder, self.most, self.side = folder, most, side
+        self.xyz = np.empty((0, 3))
+        self.tiles: dict[Path, Tile] = {}
+        self.size = 0
+
+    def add(self, xyz: Points) -> None:
+        """Take points (n, 3)."""
+        before, self.size = self.size, self.size + len(xyz)
+        if self.folder is None or self.size <= self.most:
+            # Grown in place: a list of chunks joined at the end would take twice the memory.
+            self.xyz.resize((self.size, 3), refcheck=False)
+            self.xyz[before:] = xyz
+            return
+        for k in range(0, len(self.xyz), CHUNK):
+            self._to_tiles(self.xyz[k : k + CHUNK])
+        self.xyz = np.empty((0, 3))
+        self._to_tiles(xyz)
+
+    def cloud(self, crs: CRS, vertical: str | None, least: Points, most: Points) -> Cloud:
+        """What was taken and lies between two corners (3,)."""
+        if not self.tiles:
+            low, high = extent(self.xyz)
+            if (low < least).any() or (high > most).any():
+                self.xyz = self.xyz[((self.xyz >= least) & (self.xyz <= most)).all(axis=1)]
+            return PointCloud(self.xyz, crs, vertical)
+        tiles, first = [], 0
+        for tile in sorted(self.tiles.values()):
+            if (tile.low < least).any() or (tile.high > most).any():
+                xyz = np.fromfile(tile.path).reshape(-1, 3)
+                xyz = xyz[((xyz >= least) & (xyz <= most)).all(axis=1)]
+                xyz.tofile(tile.path)
+                tile = Tile(tile.path, *extent(xyz), len(xyz))  # noqa: PLW2901
+            if tile.size:
+                tiles.append(tile._replace(first=first))
+                first += tile.size
+        return TiledCloud(tiles, crs, vertical)
+
+    def sample(self, n: int) -> Points:
+        """About n of the points, evenly."""
+        step = max(1, self.size // n)
+        if not self.tiles:
+            return self.xyz[::step]
+        return np.concatenate([np.fromfile(path).reshape(-1, 3)[::step] for path in self.tiles])
+
+    def _to_tiles(self, xyz: Points) -> None:
+        if len(xyz) == 0:
+            return
+        assert self.folder is not None  # noqa: S101
+        grid = grid_over(*extent(xyz), resolution=self.side)
+        bins = bin_points(xyz, grid)
+        column, row = round(grid.west / self.side), round(grid.north / self.side)
+        for cell in np.flatnonzero(np.diff(bins.start)):
+            points = xyz[bins.member[bins.start[cell] : bins.start[cell + 1]]]
+            path = self.folder / f"{column + cell % grid.nx}_{row - cell // grid.nx}.xyz"
+            with path.open("ab") as stream:
+                points.tofile(stream)
+            low, high = extent(points)
+            old = self.tiles.get(path, Tile(path, low, high, 0))
+            self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))
