@@ -155,7 +155,10 @@ def test_constraints_are_names_and_versions():
 
 def test_constraints_cover_what_the_project_needs():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    needed = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    needed = [
+        *project["dependencies"],
+        *(need for extra in project["optional-dependencies"].values() for need in extra),
+    ]
     pinned = {key(line.split("==")[0]) for line in constraints()}
     assert {key(re.match(r"[\w.-]+", need)[0]) for need in needed} - pinned == set()
 
