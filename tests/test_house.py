@@ -49,6 +49,8 @@ MAY_IMPORT = {
     "parcel": CHAIN | {"product"},
     "canopy_accuracy": CHAIN | {"parcel"},
     "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
+    "bench_jobs": CHAIN | {"parcel"},
+    "bench": {"errors", "paths", "tables", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
