@@ -11,12 +11,14 @@ tune: CLOUD := data/surveys/barolo/barolo.laz
 tune: BOUNDARY := data/surveys/barolo/parcels.gpkg
 tune: PARCEL := $(or $(PARCEL),F)
 endif
+SIZES ?=
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel test check accuracy tune clean
+.PHONY: help parcel test check accuracy bench tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -43,6 +45,9 @@ check: $(READY) ## Check style, format and types
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill README's tables: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--readme README.md)
 
+bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
+	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
+
 tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
 	@$(BIN)/python -m vinemap.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")
 
@@ -62,6 +67,15 @@ $(READY): pyproject.toml configs/constraints.txt
 	} >$(LOG) 2>&1 || { \
 	  grep -v 'is ignored: it is neither' $(LOG) | tail -n 15 >&2; \
 	  echo "Setting up $(VENV) failed; all that was said stands in $(LOG)" >&2; \
+	  exit 1; \
+	}
+	@touch $@
+
+$(READY_BENCH): $(READY)
+	@echo "Adding to $(VENV) what make bench compares with…"
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[dev,bench]' >$(LOG) 2>&1 || { \
+	  grep -v 'is ignored: it is neither' $(LOG) | tail -n 15 >&2; \
+	  echo "Adding to $(VENV) failed; all that was said stands in $(LOG)" >&2; \
 	  exit 1; \
 	}
 	@touch $@

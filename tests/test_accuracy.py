@@ -12,11 +12,12 @@ import shapely.affinity
 import shapely.ops
 from click.testing import CliRunner
 
-from vinemap.accuracy import CANOPY_COLUMNS, COLUMNS, as_markdown, as_text, compare, fill, main, measure, pool, table
+from vinemap.accuracy import CANOPY_COLUMNS, COLUMNS, compare, main, measure, pool, table
 from vinemap.parcel import RowMap
 from vinemap.raster import Grid, Raster, RowField
 from vinemap.scenes import hillside, rows_of
 from vinemap.synthetic import Vineyard, simulate
+from vinemap.tables import as_markdown, as_text, fill
 
 AZIMUTH, SPACING = 40.0, 2.4
 
@@ -182,10 +183,10 @@ def test_tables_for_readers_and_for_markdown(survey, perfect):
 
 def test_a_table_is_filled_between_its_marks():
     text = "a <!-- rows -->old<!-- /rows --> b <!-- canopies --><!-- /canopies --> c"
-    assert fill(text, "rows", [["x"], ["1"]]) == (
+    assert fill(text, "rows", as_markdown([["x"], ["1"]])) == (
         "a <!-- rows -->\n| x |\n| --- |\n| 1 |\n<!-- /rows --> b <!-- canopies --><!-- /canopies --> c"
     )
-    assert fill(text, "none", [["x"]]) == text
+    assert fill(text, "none", "x") == text
 
 
 def test_a_family_is_measured_and_drawn(tmp_path):

@@ -39,6 +39,7 @@ MAY_IMPORT = {
     "compiled": set(),
     "crs": {"errors"},
     "style": set(),
+    "tables": set(),
     **dict.fromkeys(DATA, BASE | DATA | {"style"}),
     **dict.fromkeys(STAGES, BASE | DATA),
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
@@ -47,7 +48,9 @@ MAY_IMPORT = {
     "product": CHAIN,
     "parcel": CHAIN | {"product"},
     "canopy_accuracy": CHAIN | {"parcel"},
-    "accuracy": CHAIN | {"parcel", "canopy_accuracy"},
+    "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
+    "bench_jobs": CHAIN | {"parcel"},
+    "bench": {"errors", "paths", "tables", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel"},
     "__main__": {"cli"},
@@ -154,7 +157,10 @@ def test_constraints_are_names_and_versions():
 
 def test_constraints_cover_what_the_project_needs():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    needed = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    needed = [
+        *project["dependencies"],
+        *(need for extra in project["optional-dependencies"].values() for need in extra),
+    ]
     pinned = {key(line.split("==")[0]) for line in constraints()}
     assert {key(re.match(r"[\w.-]+", need)[0]) for need in needed} - pinned == set()
 

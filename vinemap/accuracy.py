@@ -24,6 +24,7 @@ from vinemap.evaluate import evaluate_rows
 from vinemap.parcel import RowMap, map_rows, model_canopies
 from vinemap.raster import Raster, RowField, cell_of, sample, sample_across
 from vinemap.scenes import FAMILIES, family
+from vinemap.tables import as_markdown, as_text, fill
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -373,26 +374,6 @@ def _cell(value: float, measure: Measure, eased: float | None) -> str:
     return f"{shown:.{measure.digits}f}" + "!" * (shown < bar if measure.at_least else abs(shown) > bar)
 
 
-def as_markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Lay a table out for Markdown."""
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [lines[0], ["---"] * len(lines[0]), *lines[1:]])
-
-
-def as_text(lines: Sequence[Sequence[str]]) -> str:
-    """Lay a table out for a terminal, headings on two lines."""
-    heads = [[*head.split(": ", 1), ""][:2] for head in lines[0]]
-    rows = [*zip(*heads, strict=True), *lines[1:]]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
-
-
-def fill(text: str, name: str, lines: Sequence[Sequence[str]]) -> str:
-    """Markdown whose table between ``<!-- name -->`` and ``<!-- /name -->`` is replaced."""
-    before, mark, rest = text.partition(f"<!-- {name} -->")
-    _, end, after = rest.partition(f"<!-- /{name} -->")
-    return f"{before}{mark}\n{as_markdown(lines)}\n{end}{after}" if mark and end else text
-
-
 @click.command()
 @click.argument("families", nargs=-1, type=click.Choice(list(FAMILIES)), metavar="[FAMILY]...")
 @click.option("--seeds", default=3, show_default=True, type=click.IntRange(1), help="Surveys of each family.")
@@ -415,7 +396,7 @@ def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool
     if readme:
         text = readme.read_text(encoding="utf-8")
         for name, lines in tables.items():
-            text = fill(text, name, lines)
+            text = fill(text, name, as_markdown(lines))
         readme.write_text(text, encoding="utf-8")
     missed = sum(cell.count("!") for lines in tables.values() for line in lines[1:] for cell in line)
     click.echo(
