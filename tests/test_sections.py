@@ -215,7 +215,7 @@ def test_foliage_reaches_as_far_as_its_hulls_fall_short(n):
     points = list(np.stack([0.3 * radius * np.cos(angle), 1.2 + 0.7 * radius * np.sin(angle)], axis=2))
     sections = many_sections(points)
     peeled = peel_sections(sections.points, sections.start, share=0)
-    reach = foliage_reach(sections, peeled.area, peeled.perimeter, peeled.vertices)
+    reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
     assert len(np.unique(reach)) == 1
     hulls, true = peeled.area.mean(), np.pi * 0.3 * 0.7
     grown = hulls + reach[0] * peeled.perimeter.mean()

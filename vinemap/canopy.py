@@ -234,8 +234,10 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     low, high = (_rank(levels, q) * FOOT_BIN for q in FOOT_RANKS)
     foot = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
-    band = canopy.subset(canopy.points[:, 1] <= np.repeat(foot, np.diff(canopy.start)) + FOOT_BAND)
-    widths = _pooled(_histograms(band.points[:, 0], band.start, -1.0, FOOT_BIN, round(2 / FOOT_BIN)), near)
+    above = canopy.points[:, 1] <= np.repeat(foot + FOOT_BAND, np.diff(canopy.start))
+    # Points higher up go to a bin of their own, that doesn't count.
+    across = np.where(above, np.clip(canopy.points[:, 0], -1.0, 0.999), 2.0)
+    widths = _pooled(_histograms(across, canopy.start, -1.0, FOOT_BIN, round(2 / FOOT_BIN) + 1)[:, :-1], near)
     right, left = (_rank(widths, q) * FOOT_BIN - 1.0 for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
     feet = np.stack([(left + right) / 2, foot, left, foot, right, foot], axis=-1).reshape(m, 3, 2)
     return canopy, feet

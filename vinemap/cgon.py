@@ -40,8 +40,10 @@ class Peeled(NamedTuple):
     """(m,) area of the kept points' convex hull, m²; NaN for fewer than 3 finite points."""
     perimeter: Floats
     """(m,) length of that hull's outline, m."""
-    vertices: Ints
-    """(m,) its vertices."""
+    hull: Floats
+    """(h, 2) the hulls' vertices, section after section, counter-clockwise, m."""
+    start: Ints
+    """(m + 1,) where each section's begin; none for fewer than 3 finite points."""
 
 
 class Enclosures(NamedTuple):
@@ -82,9 +84,15 @@ def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -
     offsets = _checked(start, len(section), share)
     m = len(offsets) - 1
     kept, area, perimeter = np.isfinite(section), np.full(m, math.nan), np.full(m, math.nan)
-    vertices = np.zeros(m, dtype=np.int64)
-    in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, vertices), stretches(m))
-    return Peeled(kept, area, perimeter, vertices)
+    hulls, size = np.empty(len(section), dtype=np.complex128), np.zeros(m, dtype=np.int64)
+    in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, hulls, size), stretches(m))
+    return Peeled(kept, area, perimeter, *_packed(hulls, offsets[:-1], size))
+
+
+def _packed(points: Points, at: Ints, size: Ints) -> tuple[Floats, Ints]:
+    """Points (k, 2) that were written with room between them, ``size`` of them from each place on, and their starts."""
+    start = np.concatenate([[0], np.cumsum(size)])
+    return as_pairs(points[np.arange(start[-1]) + np.repeat(at - start[:-1], size)]), start
 
 
 def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike) -> tuple[Floats, Ints, Floats]:
@@ -114,11 +122,9 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
     room = offsets + 2 * np.arange(len(offsets))
     outline, size = np.empty(2 * room[-1], dtype=np.complex128), np.zeros(len(fixed), dtype=np.int64)
     in_threads(lambda part: _grow_all(*part, section, offsets, fixed, out, outline, size), stretches(len(size)))
-    first = np.concatenate([[0], np.cumsum(size)])
-    outline = outline[np.arange(first[-1]) + np.repeat(2 * room[:-1] - first[:-1], size)]
     left = np.where(fixed[:, 1].real >= fixed[:, 2].real, 0.5, -0.5)
     moved = fixed + out[:, None] * np.stack([0 * left - 1j, left - 1j, -left - 1j], axis=1)
-    return as_pairs(outline), first, as_pairs(moved)
+    return *_packed(outline, 2 * room[:-1], size), as_pairs(moved)
 
 
 def enclose(
@@ -624,14 +630,16 @@ def _peel_all(
     kept: Flags,
     area: Floats,
     perimeter: Floats,
-    vertices: Ints,
+    hulls: Points,
+    size: Ints,
 ) -> None:
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
         if kept[mine].sum() >= 3:
             ring = _peel_one(points[mine], kept[mine], share)
-            area[k], vertices[k], perimeter[k] = _area(ring), len(ring), 0.0
+            area[k], size[k], perimeter[k] = _area(ring), len(ring), 0.0
             for i in range(len(ring)):
+                hulls[start[k] + i] = ring[i]
                 perimeter[k] += abs(ring[i] - ring[i - 1])
 
 

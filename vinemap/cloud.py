@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,7 @@ class PointCloud:
     heights: NDArray[np.floating] = field(default_factory=lambda: np.empty(0, dtype=np.float32))
     first: int = 0
     classification: NDArray[np.uint8] | None = None
-    _bins: list[Bins] = field(default_factory=list, repr=False, compare=False)
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def size(self) -> int:
@@ -49,11 +49,14 @@ class PointCloud:
     @property
     def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Least and greatest coordinates (3,)."""
-        return extent(self.xyz)
+        if "extent" not in self._kept:
+            self._kept["extent"] = extent(self.xyz)
+        corners: tuple[NDArray[np.float64], NDArray[np.float64]] = self._kept["extent"]
+        return corners
 
-    def parts(self, near: shapely.Geometry | None = None) -> Iterator[PointCloud]:
-        """The cloud in parts that fit in memory, those near a geometry at the least: here it is one."""
-        del near
+    def parts(self, near: shapely.Geometry | None = None, reach: float = 0.0) -> Iterator[PointCloud]:
+        """The cloud in parts that fit in memory, at the least those within metres of a geometry: here it is one."""
+        del near, reach
         yield self
 
     def groups(self, rows: Sequence[Values]) -> list[NDArray[np.int64]]:
@@ -62,20 +65,21 @@ class PointCloud:
 
     def bins(self, grid: Grid) -> Bins:
         """The points sorted into the cells of a grid; kept until another grid's are asked for, or all is forgotten."""
-        if not self._bins or self._bins[0].grid != grid:
-            self._bins[:] = [bin_points(self.xyz, grid)]
-        return self._bins[0]
+        if "bins" not in self._kept or self._kept["bins"].grid != grid:
+            self._kept["bins"] = bin_points(self.xyz, grid)
+        bins: Bins = self._kept["bins"]
+        return bins
 
     def forget(self) -> None:
         """Give back the memory of what is kept for speed."""
-        self._bins.clear()
+        self._kept.clear()
 
     def above(self, dtm: Raster) -> PointCloud:
         """The cloud with its heights above a terrain model."""
         return replace(self, heights=above(dtm, self.xyz))
 
 
-ROWS_AT_ONCE = 8_000_000
+ROWS_AT_ONCE = 4_000_000
 """Points, about, of the rows that are worked together."""
 
 

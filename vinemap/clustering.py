@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from vinemap.compiled import compiled
+from vinemap.compiled import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -84,13 +84,14 @@ def cluster_rows(
     pieces = np.unique(pieces[kept], return_inverse=True)[1]
     if thesis:
         return out.assign(cluster=pieces)
-    ends = _ends(xy[kept], direction[kept], spacing[kept], pieces, graph[kept][:, kept])
+    position = _position_along(np.flatnonzero(kept), pieces, graph)
+    ends = _ends(xy[kept], direction[kept], spacing[kept], pieces, position)
     pairs = _candidates(ends, max_gap)
     pairs = pairs[~_over_track_or_headland(ends, pairs, xy[kept], track_width)]
     return out.assign(cluster=_join(pairs, len(ends.spacing))[pieces])
 
 
-def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values) -> coo_array:
+def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values) -> csr_array:
     """Distances in metres (n, n, sparse) from each point (n, 2) to those in its elliptic region of interest.
 
     Cases A, B and C of the thesis give the points of an ellipse to one cluster and merge the clusters that it
@@ -111,12 +112,16 @@ def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Value
     order = np.argsort(key, kind="stable")
     first = np.searchsorted(key[order], np.arange((int(column[:, 0].max(initial=0)) + 2) * wide + 1))
     axis = np.column_stack([np.cos(direction), np.sin(direction)])
-    i, j, distance = _linked(xy, axis, along, across, key, wide, order, first)
-    return coo_array((distance, (i, j)), shape=(n, n)).tocsr()
+    found = in_threads(lambda part: _linked(*part, xy, axis, along, across, key, wide, order, first), stretches(n))
+    links, others, distance = (np.concatenate(column) for column in zip(*found, strict=True))
+    start = np.concatenate([[0], np.cumsum(links)])
+    return csr_array((distance, others, start.astype(np.int32)), shape=(n, n))
 
 
 @compiled
 def _linked(
+    begin: int,
+    end: int,
     xy: Values,
     axis: Values,
     along: Values,
@@ -125,14 +130,15 @@ def _linked(
     wide: int,
     order: Labels,
     first: Labels,
-) -> tuple[Labels, Labels, Values]:
-    """Pairs of points i < j of which one lies in the other's ellipse, and their distance.
+) -> tuple[Labels, NDArray[np.int32], Values]:
+    """Numbers of points j > i for each point i of which one lies in the other's ellipse, those points, and distances.
 
     Points are sorted (``order``) into the cells of a grid ``wide`` columns wide, no smaller than the ellipses; those
     of a cell start at ``first``.
     """
-    rows, columns, distances = [], [], []
-    for i in range(len(xy)):
+    links = np.zeros(end - begin, dtype=np.int64)
+    others, distances = [np.int32(0)], [0.0]
+    for i in range(begin, end):
         for c in range(9):
             cell = key[i] + (c // 3 - 1) * wide + c % 3 - 1
             for j in order[first[cell] : first[cell + 1]]:
@@ -143,12 +149,12 @@ def _linked(
                     u = x * axis[p, 0] + y * axis[p, 1]
                     v = y * axis[p, 0] - x * axis[p, 1]
                     if (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1:
-                        rows.append(i)
-                        columns.append(j)
+                        links[i - begin] += 1
+                        others.append(np.int32(j))
                         # A graph's zero is no edge, so that points on one spot need a length.
                         distances.append(max(np.hypot(x, y), 1e-6))
                         break
-    return np.array(rows), np.array(columns), np.array(distances)
+    return links, np.array(others)[1:], np.array(distances)[1:]
 
 
 class _Ends(NamedTuple):
@@ -164,13 +170,12 @@ class _Ends(NamedTuple):
     """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
 
 
-def _components(graph: coo_array) -> Labels:
+def _components(graph: csr_array) -> Labels:
     labels: Labels = connected_components(graph, directed=False)[1].astype(np.int64)
     return labels
 
 
-def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, graph: coo_array) -> _Ends:
-    position = _position_along(pieces, graph)
+def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, position: Values) -> _Ends:
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
     n = 2 * (len(first) - 1)
@@ -197,18 +202,20 @@ def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, graph:
     return out
 
 
-def _position_along(pieces: Labels, graph: coo_array) -> Values:
-    """Way in metres (n,) from one end of its piece to each point, along the piece, however it bends."""
+def _position_along(points: Labels, pieces: Labels, graph: csr_array) -> Values:
+    """Way in metres (n,) from one end of its piece to each point, along the piece, however it bends.
 
-    def farthest(distance: Values) -> Labels:
-        order = np.lexsort((distance, pieces))
-        last = np.searchsorted(pieces[order], np.arange(pieces.max() + 1), side="right") - 1
-        return order[last]
+    ``points`` (n,) are the indices of those in the graph that belong to ``pieces`` (n,), all of each piece.
+    """
 
-    anywhere = np.unique(pieces, return_index=True)[1]
-    end = farthest(dijkstra(graph, directed=False, indices=anywhere, min_only=True))
-    position: Values = dijkstra(graph, directed=False, indices=end, min_only=True)
-    return position
+    def way_from(starts: Labels) -> Values:
+        found: Values = dijkstra(graph, directed=False, indices=points[starts], min_only=True)[points]
+        return found
+
+    way = way_from(np.unique(pieces, return_index=True)[1])
+    order = np.lexsort((way, pieces))
+    last = np.searchsorted(pieces[order], np.arange(pieces.max() + 1), side="right") - 1
+    return way_from(order[last])
 
 
 def _like(axis: Values, way: Values) -> Values:

@@ -9,19 +9,23 @@ from __future__ import annotations
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
 from numba import njit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator
 
 F = TypeVar("F", bound="Callable[..., object]")
 S = TypeVar("S")
 T = TypeVar("T")
 
 CORES = os.cpu_count() or 1
+FEW = 16
+"""Items that one core has done before another would have begun."""
 _here = threading.local()
 
 
@@ -38,17 +42,41 @@ def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
 
     Within one of its own threads it does one after the other.
     """
-    if getattr(_here, "busy", False):
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(CORES, initializer=_mark_busy) as pool:
-        return list(pool.map(function, items))
+    work = list(items)
+    if len(work) < 2 or getattr(_here, "busy", False):
+        return [function(item) for item in work]
+    return list(_pool().map(function, work))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(CORES, initializer=_mark_busy)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads don't live on in a child
 
 
 def _mark_busy() -> None:
     _here.busy = True
 
 
+@contextmanager
+def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
+    """Give items of which the next is made in another thread while one is worked on."""
+
+    def following() -> Iterator[T]:
+        coming = maker.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = maker.submit(next, items, None)
+            yield item
+
+    with ThreadPoolExecutor(1) as maker:
+        yield following()
+
+
 def stretches(n: int) -> list[tuple[int, int]]:
-    """Stretches of n items, one a core, as first and last + 1."""
-    bounds = [n * k // CORES for k in range(CORES + 1)]
+    """Stretches of n items, one a core but for few items, as first and last + 1."""
+    parts = CORES if n >= FEW else 1
+    bounds = [n * k // parts for k in range(parts + 1)]
     return list(pairwise(bounds))

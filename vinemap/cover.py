@@ -7,18 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import Raster, block_sum, cell_of, grid_over, window
+from vinemap.compiled import compiled, in_threads
+from vinemap.raster import Raster, block_sum, cell_of, grid_over
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
-    from vinemap.raster import Grid
     from vinemap.tiles import Cloud
 
     Values = NDArray[np.floating]
+    Counts = NDArray[np.uint16]
 
+BATCH = 1_000_000
+"""Points whose cells are looked up at once."""
+MOST = 65_535
+"""Points that a cell counts."""
 BLOCK = 0.25
 """Metres, about: side of the blocks of cells in which tall and wide objects are sought."""
 TALLEST = 40.0
@@ -53,42 +56,38 @@ def canopy_cover(
         of vines (huts, hedges, bushes) is left out.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    counts = np.zeros((3, *grid.shape))
+    counts = np.zeros((3, grid.ny * grid.nx), dtype=np.uint16)
     for part in cloud.parts():
-        around, here = window(grid, *part.extent)
-        counts[:, *here] += _count_layers(part, around, (low, high, TALLEST))
-    everything, canopy, tall = counts
+        for start in range(0, part.size, BATCH):
+            batch = slice(start, start + BATCH)
+            _count(cell_of(part.xyz[batch], grid), part.heights[batch], (low, high, TALLEST), counts)
+    everything, canopy, tall = counts.reshape(3, *grid.shape)
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
-    cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma), [canopy, everything])
-    cover /= blurred + 0.1 * density
+    cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
+    cover /= blurred + np.float32(0.1 * density)
     cover[_no_vines(everything, canopy, tall, resolution)] = 0.0
     return Raster(cover, grid, cloud.crs)
 
 
-def _count_layers(cloud: PointCloud, grid: Grid, limits: tuple[float, float, float]) -> NDArray[np.int32]:
-    """Points of each cell (3, ny, nx): all, those between the first two heights, those between the last two."""
-    cells, heights = cell_of(cloud.xyz, grid), cloud.heights
-    counts = in_threads(lambda part: _count(*part, cells, heights, limits, grid.ny * grid.nx), stretches(len(cells)))
-    return np.sum(counts, axis=0, dtype=np.int32).reshape(3, *grid.shape)
-
-
 @compiled
 def _count(
-    first: int, last: int, cells: NDArray[np.int32], heights: Values, limits: tuple[float, float, float], n: int
-) -> NDArray[np.int32]:
+    cells: NDArray[np.int32], heights: Values, limits: tuple[float, float, float], counts: NDArray[np.uint16]
+) -> None:
+    """Count points in cells (3, n): all, those between the first two heights, those between the last two."""
     low, high, highest = limits
-    counts = np.zeros((3, n), dtype=np.int32)
-    for p in range(first, last):
-        counts[0, cells[p]] += 1
+    for p in range(len(cells)):
+        cell = cells[p]
+        if counts[0, cell] == MOST:
+            continue
+        counts[0, cell] += 1
         if low <= heights[p] <= high:
-            counts[1, cells[p]] += 1
+            counts[1, cell] += 1
         elif high < heights[p] < highest:
-            counts[2, cells[p]] += 1
-    return counts
+            counts[2, cell] += 1
 
 
-def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: float) -> NDArray[np.bool_]:
+def _no_vines(everything: Counts, canopy: Counts, tall: Counts, resolution: float) -> NDArray[np.bool_]:
     """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them.
 
     Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
@@ -96,7 +95,8 @@ def _no_vines(everything: Values, canopy: Values, tall: Values, resolution: floa
     k = max(1, round(BLOCK / resolution))
     cell = k * resolution
     # Summed over 3 x 3 blocks, so that a sparse cloud is judged by more than a point or two.
-    all_, mass, above = (9 * uniform_filter(block_sum(v, k), 3) for v in (everything, canopy + tall, tall))
+    all_, low, above = (9 * uniform_filter(block_sum(v, k), 3) for v in (everything, canopy, tall))
+    mass = low + above
     high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
     wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), _disc(WIDEST / 2, cell))
     out: NDArray[np.bool_] = binary_dilation(high | wide, _disc(0.5, cell))

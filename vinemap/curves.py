@@ -15,6 +15,7 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from vinemap.compiled import compiled, in_threads
 from vinemap.raster import Raster, sample_across
 from vinemap.row_frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
 
@@ -83,24 +84,32 @@ def trace_rows(
     GeoDataFrame
         LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
     """
-    records = []
-    for _, points in key_points.groupby("cluster"):
-        xy = points.get_coordinates().to_numpy()
-        spacing = float(points["spacing_m"].median())
-        ordered = order_key_points(xy, np.radians(points["direction_deg"].to_numpy()), threshold=threshold)
-        course = _centred(ordered, cover, spacing) if len(ordered) > 1 else None
+    xy, direction, spacing = (
+        key_points.get_coordinates().to_numpy(),
+        np.radians(key_points["direction_deg"].to_numpy()),
+        key_points["spacing_m"].to_numpy(),
+    )
+
+    def trace(members: NDArray[np.int64]) -> tuple[float, float, float, shapely.LineString] | None:
+        ordered = order_key_points(xy[members], direction[members], threshold=threshold)
+        between = float(np.median(spacing[members]))
+        course = _centred(ordered, cover, between) if len(ordered) > 1 else None
         if course is None or course.width > max_width or course.support < min_support:
-            continue
+            return None
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
-        if slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius:
-            records.append((spacing, course.width, course.amount, line))
+        fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
+        return (between, course.width, course.amount, line) if fits else None
+
+    clusters = key_points.groupby("cluster").indices
+    records = [record for record in in_threads(trace, clusters.values()) if record]
     columns = ("spacing_m", "width", "amount")
     rows = gpd.GeoDataFrame(
         {name: [r[k] for r in records] for k, name in enumerate(columns)},
         geometry=[r[-1] for r in records],
         crs=key_points.crs,
     )
+    rows["simple"] = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     rows = rows[~_repeated(rows)]
     rows = rows[_like_the_others(rows)]
     least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
@@ -131,27 +140,35 @@ def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -
     """
     start = int(np.argmin(np.hypot(*(xy - np.median(xy, axis=0)).T)))
     heading = np.array([np.cos(direction[start]), np.sin(direction[start])])
-    halves = [_scan(xy, direction, start, way * heading, threshold) for way in (-1, 1)]
-    return xy[halves[0][::-1] + [start] + halves[1]]
+    halves = [_scan(xy, direction, start, way * heading, threshold) for way in (-1.0, 1.0)]
+    return xy[[*halves[0][::-1], start, *halves[1]]]
 
 
+@compiled
 def _scan(xy: Values, direction: Values, start: int, heading: Values, threshold: float) -> list[int]:
-    found: list[int] = []
+    """Indices of the enhanced key points that follow on a start towards a heading."""
+    found = [start]
+    found.pop()
     here = start
     while len(found) < len(xy):
-        offset = xy - xy[here]
-        ahead = offset @ heading
-        beside = np.abs(offset[:, 0] * heading[1] - offset[:, 1] * heading[0])
-        cone = (ahead > 0) & (beside <= 0.5 * ahead)
-        far = cone & (ahead >= threshold)
-        if not far.any():
-            if cone.any() and ahead[cone].max() > 0.25 * threshold:
-                found.append(int(np.argmax(np.where(cone, ahead, -1))))
+        closest, farthest, least, most = -1, -1, np.inf, 0.25 * threshold
+        for k in range(len(xy)):
+            x, y = xy[k, 0] - xy[here, 0], xy[k, 1] - xy[here, 1]
+            ahead = x * heading[0] + y * heading[1]
+            if ahead <= 0 or abs(x * heading[1] - y * heading[0]) > 0.5 * ahead:
+                continue
+            if threshold <= ahead < least:
+                closest, least = k, ahead
+            if ahead > most:
+                farthest, most = k, ahead
+        if closest < 0:
+            if farthest >= 0:
+                found.append(farthest)
             return found
-        here = int(np.argmin(np.where(far, ahead, np.inf)))
+        here = closest
         found.append(here)
         axis = np.array([np.cos(direction[here]), np.sin(direction[here])])
-        heading = axis if axis @ heading >= 0 else -axis
+        heading = axis if axis[0] * heading[0] + axis[1] * heading[1] >= 0 else -axis
     return found
 
 
@@ -196,7 +213,7 @@ def _turn(curve: Values) -> float:
 
 def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     """Whether a row lies for the most part within a quarter of a spacing of a longer one."""
-    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
+    lines = rows["simple"].to_numpy()
     out = np.zeros(len(rows), dtype=bool)
     order = np.argsort(shapely.length(lines))
     for n, i in enumerate(order):
@@ -233,7 +250,7 @@ def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
 
 def _neighbours(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
     """Pairs (k, 2) of rows of about the same direction that lie no more than a spacing apart."""
-    lines = shapely.simplify(rows.geometry.to_numpy(), 0.02)
+    lines = rows["simple"].to_numpy()
     if len(rows) < 2:
         return np.empty((0, 2), dtype=np.int64)
     chord = np.array([np.diff(shapely.get_coordinates(line)[[0, -1]], axis=0)[0] for line in lines])

@@ -87,7 +87,7 @@ def terrain_model(
     """
     if engine == "pdal":
         return classified_terrain(cloud, resolution=resolution)
-    blocks = max(1, round(COARSE / resolution))
+    blocks = _blocks(resolution)
     grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
     wide = coarser(grid, resolution=blocks * resolution)
     x, y = grid.centres()
@@ -104,9 +104,14 @@ def terrain_model(
     return surface
 
 
+def _blocks(resolution: float) -> int:
+    """Cells a side of the blocks of the coarse surface."""
+    return max(1, round(COARSE / resolution))
+
+
 def tile_side(resolution: float) -> float:
     """Side in metres, about 64, of tiles of a cloud whose edges are those of the terrain model's blocks of cells."""
-    block = max(1, round(COARSE / resolution)) * resolution
+    block = _blocks(resolution) * resolution
     return max(1, round(64 / block)) * block
 
 
@@ -121,7 +126,7 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
         If no point is classified as ground.
     """
     low, high = cloud.extent
-    grid = grid_over(low, high, resolution=resolution, multiple=max(1, round(COARSE / resolution)))
+    grid = grid_over(low, high, resolution=resolution, multiple=_blocks(resolution))
     reference = float(np.round((low[2] + high[2]) / 2))
     n, total = np.zeros((2, grid.ny * grid.nx))
     for part in cloud.parts():
@@ -166,8 +171,7 @@ def canopy_height_model(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
     A cell stands no higher than the highest of its eight neighbours by more than ``SPIKE``, so that a point in the
     air doesn't make a tower. The cloud has its heights, and the resolution is that of its terrain model.
     """
-    blocks = max(1, round(COARSE / resolution))
-    grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
+    grid = grid_over(*cloud.extent, resolution=resolution, multiple=_blocks(resolution))
     n, found = _order_statistics(cloud, None, grid, (0.98,))
     height = np.maximum(found[0], 0)
     around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
@@ -222,7 +226,7 @@ def _order_statistics(
     shape = [side // blocks for side in grid.shape]
     n, found = np.zeros(shape), np.zeros((len(quantiles), *shape))
     for part in cloud.parts():
-        around, (rows, columns) = window(grid, *part.extent, multiple=blocks)
+        around, (rows, columns) = window(grid, *part.extent, multiple=_blocks(grid.resolution))
         heights = part.heights if surface is None else above(surface, part.xyz)
         here = slice(rows.start // blocks, rows.stop // blocks), slice(columns.start // blocks, columns.stop // blocks)
         n[here], found[:, *here] = quantiles_in(part.bins(around), heights, quantiles, blocks=blocks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import contextmanager
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from vinemap.compiled import ahead
 from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 from vinemap.errors import InputError
 from vinemap.tiles import Collector
@@ -110,7 +112,9 @@ def open_cloud(
         if first is None:
             raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
         target = metric_crs(source, *np.median(first[:, :2], axis=0))
-        yield target, vertical_name(source), (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
+        metric = (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
+        with ahead(metric) as prepared:
+            yield target, vertical_name(source), prepared
 
 
 def write_classified(
@@ -228,11 +232,12 @@ def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
 def _query(path: Path, box: Box) -> Any | None:
     """Points of a COPC file in a box; None where its index can't be read."""
     from laspy.copc import Bounds, CopcReader
+    from laspy.errors import LaspyException
 
     try:
         with path.open("rb") as stream:
             return CopcReader(stream, decompression_selection=_needed()).query(bounds=Bounds(*box))
-    except Exception:  # laspy and lazrs raise many kinds: the file may still be read through
+    except (LaspyException, LookupError, OSError, RuntimeError, ValueError, struct.error):
         return None
 
 

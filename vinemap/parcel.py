@@ -325,8 +325,8 @@ def _model_row(canopy: Canopy, *, settings: Settings) -> _RowModel:
     sections, feet = find_feet(canopy.sections)
     peeled = peel_sections(sections.points, sections.start, share=options.share)
     sections = sections.subset(peeled.kept)
-    reach = foliage_reach(sections, peeled.area, peeled.perimeter, peeled.vertices)
-    outline, start, grown = grow(sections.points, sections.start, feet, reach)
+    reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
+    outline, start, grown = grow(peeled.hull, peeled.start, feet, reach)
     on_foliage = options.foot == "foliage"
     model = enclose(outline, start, grown if on_foliage else canopy.soil, c=options.c, share=0.0, slide=on_foliage)
     # The foot that the sections around tell may leave a young vine nothing.

@@ -11,6 +11,7 @@ import shapely
 
 from vinemap import paths
 from vinemap.blocks import outline_blocks
+from vinemap.compiled import in_threads
 from vinemap.crs import project
 from vinemap.errors import InputError
 from vinemap.mesh import Mesh, write_glb
@@ -91,7 +92,6 @@ def write_product(
     OSError
         If one can't be written.
     """
-    write_geopackage(layers, paths.geopackage(folder, parcel))
     rasters = {
         "dtm": (surfaces[0], "Terrain elevation", "m"),
         "chm": (surfaces[1], "Height above terrain", "m"),
@@ -99,18 +99,27 @@ def write_product(
         "row_spacing": (field.spacing, "Inter-row spacing", "m"),
         "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
     }
-    for kind, (raster, description, unit) in rasters.items():
-        resampling = "nearest" if unit == "degree" else "average"
-        write_cog(raster, paths.raster(folder, parcel, kind), description=description, unit=unit, resampling=resampling)
-    low, high = points.extent
-    write_glb(
-        meshes,
-        paths.canopy_mesh(folder, parcel),
-        origin=tuple(np.round((low + high) / 2).tolist()),
-        crs=points.crs.to_string(),
-        extras={"vertical": points.vertical},
-        plain=plain,
-    )
+
+    def write_rasters() -> None:
+        for kind, (raster, description, unit) in rasters.items():
+            how = {"description": description, "unit": unit, "resampling": "nearest" if unit == "degree" else "average"}
+            write_cog(raster, paths.raster(folder, parcel, kind), **how)
+
+    def write_meshes() -> None:
+        low, high = points.extent
+        write_glb(
+            meshes,
+            paths.canopy_mesh(folder, parcel),
+            origin=tuple(np.round((low + high) / 2).tolist()),
+            crs=points.crs.to_string(),
+            extras={"vertical": points.vertical},
+            plain=plain,
+        )
+
+    def write_layers() -> None:
+        write_geopackage(layers, paths.geopackage(folder, parcel))
+
+    in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes])
 
 
 def fingerprint(path: Path) -> dict[str, Any]:

@@ -126,13 +126,11 @@ def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int32]:
     return out
 
 
-def block_sum(values: NDArray[np.floating], k: int) -> NDArray[np.floating]:
+def block_sum(values: NDArray[np.floating] | NDArray[np.integer], k: int) -> NDArray[np.float64]:
     """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)); beyond the edge there is nothing."""
     ny, nx = (-(-n // k) for n in values.shape)
-    padded = np.zeros((ny * k, nx * k))
-    padded[: values.shape[0], : values.shape[1]] = values
-    down = np.add.reduce([padded[i::k] for i in range(k)])
-    out: NDArray[np.floating] = np.add.reduce([down[:, j::k] for j in range(k)])
+    out = np.zeros((ny, nx))
+    in_threads(lambda part: _block_sums(*part, values, k, out), stretches(ny))
     return out
 
 
@@ -140,14 +138,14 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
     points = np.asarray(xy, dtype=float)
     flat = _columns(points.reshape(-1, points.shape[-1]))
-    values, out = _columns(raster.values), np.empty(len(flat))
+    values, out = np.ascontiguousarray(raster.values), np.empty(len(flat))
     in_threads(lambda part: _bilinear(*part, values, raster.grid, flat, out), stretches(len(flat)))
     return out.reshape(points.shape[:-1])
 
 
 def above(raster: Raster, xyz: NDArray[np.floating]) -> NDArray[np.float32]:
     """Metres (n,) that points (n, 3) lie above a raster of elevations, as it is sampled."""
-    points, values = _columns(xyz), _columns(raster.values)
+    points, values = _columns(xyz), np.ascontiguousarray(raster.values)
     out = np.empty(len(points), dtype=np.float32)
     in_threads(lambda part: _above(*part, values, raster.grid, points, out), stretches(len(points)))
     return out
@@ -157,7 +155,8 @@ def sample_across(
     raster: Raster, origin: NDArray[np.floating], normal: NDArray[np.floating], offsets: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Bilinear values (n, m) at offsets (m,) from origins (n, 2) along unit vectors (n, 2)."""
-    values, starts, ways, at = (_columns(v) for v in (raster.values, origin, normal, offsets))
+    values = np.ascontiguousarray(raster.values)
+    starts, ways, at = (_columns(v) for v in (origin, normal, offsets))
     out = np.empty((len(origin), len(offsets)))
     in_threads(lambda part: _bilinear_across(*part, values, raster.grid, starts, ways, at, out), stretches(len(origin)))
     return out
@@ -166,6 +165,15 @@ def sample_across(
 def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """The same (n, k) as compiled code wants it."""
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+@compiled
+def _block_sums(
+    first: int, last: int, values: NDArray[np.floating] | NDArray[np.integer], k: int, out: NDArray[np.float64]
+) -> None:
+    for i in range(first * k, min(last * k, values.shape[0])):
+        for j in range(values.shape[1]):
+            out[i // k, j // k] += values[i, j]
 
 
 @compiled

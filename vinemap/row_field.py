@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.compiled import compiled, in_threads
 from vinemap.raster import Grid, Raster, RowField, coarser
+from vinemap.row_frame import at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -91,16 +92,17 @@ def estimate_row_field(
 
 
 def _block_mean(raster: Raster, resolution: float) -> Raster:
+    """Means of the cells whose centres lie in each of coarser cells; 0 where there is none."""
     grid = coarser(raster.grid, resolution=resolution)
     x, y = raster.grid.centres()
-    jj, ii = np.meshgrid(
-        np.minimum(((x - grid.west) / resolution).astype(int), grid.nx - 1),
-        np.minimum(((grid.north - y) / resolution).astype(int), grid.ny - 1),
-    )
-    flat = (ii * grid.nx + jj).ravel()
-    total = np.bincount(flat, weights=raster.values.ravel(), minlength=grid.ny * grid.nx)
-    n = np.bincount(flat, minlength=grid.ny * grid.nx)
-    return Raster((total / np.maximum(n, 1)).reshape(grid.shape), grid, raster.crs)
+    j = np.minimum(((x - grid.west) / resolution).astype(int), grid.nx - 1)
+    i = np.minimum(((grid.north - y) / resolution).astype(int), grid.ny - 1)
+    (row, first_row), (column, first_column) = (np.unique(v, return_index=True) for v in (i, j))
+    down = np.add.reduceat(raster.values, first_row, axis=0, dtype=np.float64)
+    mean = np.zeros(grid.shape)
+    n = np.outer(np.bincount(i), np.bincount(j))[np.ix_(row, column)]
+    mean[np.ix_(row, column)] = np.add.reduceat(down, first_column, axis=1) / n
+    return Raster(mean, grid, raster.crs)
 
 
 def _scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
@@ -318,12 +320,11 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
     """
     if len(rows) == 0:
         return field
-    lines = shapely.force_2d(rows.geometry.to_numpy())
-    at = [np.linspace(0, line.length, max(2, round(2 * line.length) + 1)) for line in lines]
-    row = np.repeat(np.arange(len(lines)), [len(a) for a in at])
-    position = np.concatenate(at)
+    curves = [shapely.get_coordinates(line) for line in rows.geometry]
+    positions = [np.linspace(0, length, max(2, round(2 * length) + 1)) for length in rows.length]
+    row = np.repeat(np.arange(len(curves)), [len(position) for position in positions])
     here, before, after = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines[row], np.clip(position + d, 0, None)))
+        np.concatenate([at(curve, position + d) for curve, position in zip(curves, positions, strict=True)])
         for d in (0.0, -2.0, 2.0)
     )
     chord = after - before

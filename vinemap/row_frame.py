@@ -80,7 +80,7 @@ def points_of_rows(
         within = np.full(len(curves), -1.0)
         within[rows] = reach[rows]
         found = []
-        for part in cloud.parts(shapely.MultiLineString([curves[k] for k in rows]).buffer(float(reach[rows].max()))):
+        for part in cloud.parts(shapely.MultiLineString([curves[k] for k in rows]), float(reach[rows].max())):
             near = _coordinates(part.xyz, lookup, within)
             found.append((near._replace(member=near.member + np.int32(part.first)), take(part, near.member)))
         yield rows, *_joined(found, rows)

@@ -60,11 +60,11 @@ class TiledCloud:
         low, high = (np.array([tile[k] for tile in self.tiles]) for k in (1, 2))
         return low.min(axis=0), high.max(axis=0)
 
-    def parts(self, near: shapely.Geometry | None = None) -> Iterator[PointCloud]:
-        """The cloud in parts that fit in memory, those near a geometry at the least."""
+    def parts(self, near: shapely.Geometry | None = None, reach: float = 0.0) -> Iterator[PointCloud]:
+        """The cloud in parts that fit in memory, or those within metres of a geometry."""
         for tile in self.tiles:
             box = shapely.box(*tile.low[:2], *tile.high[:2])
-            if near is None or shapely.intersects(box, near):
+            if near is None or shapely.dwithin(box, near, reach):
                 part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
                 yield part.above(self.dtm) if self.dtm else part
 
