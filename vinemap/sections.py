@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+SOIL, SOIL_POINTS = 0.3, 100
+"""Metres from the terrain within which points are the soil's, and how many of them, about, a section needs: dense
+clouds have many more, which would tell no more of the inter-row's elevation."""
 HALF = 0.9
 """Metres to both sides of a row within which points are taken for canopy."""
 
@@ -48,7 +51,8 @@ def cut_sections(
 ) -> list[T]:
     """Cut sections along every row, except where it has no canopy (Eq. 2–3), and make something of each row's.
 
-    All sections together have more points than the cloud; what is made of them row by row, on all cores, is less.
+    Of the soil's points some are enough. All sections together have more points than the cloud; what is made of them
+    row by row, on all cores, is less.
 
     Parameters
     ----------
@@ -77,8 +81,15 @@ def cut_sections(
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
         canopy = float(np.count_nonzero((height >= low) & (height <= high) & (np.abs(left) < HALF)))
-        per_metre = max(canopy, 1.0) / max(len(position) * step, step)
-        n, index = _members(along, position, max(width, min(max_width, min_points / per_metre)) / 2)
+        length = max(len(position) * step, step)
+        a = max(width, min(max_width, min_points * length / max(canopy, 1.0)))
+        soil = np.abs(height) < SOIL
+        every = max(1, int(np.count_nonzero(soil) * a / length / SOIL_POINTS))
+        if every > 1:
+            kept = ~soil
+            kept[::every] = True
+            along, left, member, elevation, height = (v[kept] for v in (along, left, member, elevation, height))
+        n, index = _members(along, position, a / 2)
         here = at(curves[row], position)
         level = sample(dtm, here)
         return then(
