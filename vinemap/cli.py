@@ -86,6 +86,53 @@ def run(
 
 
 @commands.command()
+@click.argument("cloud", type=FILE)
+@click.option("--boundaries", type=FILE, required=True, help="Polygons of the parcels, named in one of their columns.")
+@click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none or a wrong one.")
+@click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
+@click.option("--origin", type=_Origin(), help="Origin of the local frame {Main}; each parcel's corner by default.")
+@click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+@click.option("--workers", type=click.IntRange(1), help="Parcels worked at once; as many as there are cores.")
+@click.option("--limit", type=click.FloatRange(min=1), help="Seconds that a parcel may take.")
+def survey(
+    cloud: Path,
+    boundaries: Path,
+    parcels: tuple[str, ...],
+    crs: str | None,
+    out: Path | None,
+    origin: Any,
+    settings: Path | None,
+    workers: int | None,
+    limit: float | None,
+) -> None:
+    """Map many parcels of CLOUD (LAS, LAZ or COPC) in one job; exit code 1 if one of them fails."""
+    from vinemap import paths
+    from vinemap.config import Settings, check_name, load_settings
+    from vinemap.crs import parse_crs
+    from vinemap.survey import map_survey
+    from vinemap.vector import parcel_names
+
+    outcomes = map_survey(
+        cloud,
+        out or paths.survey_products(paths.stem(cloud)),
+        parcels=[check_name(name) for name in parcels or parcel_names(boundaries)],
+        boundaries=boundaries,
+        settings=load_settings(settings) if settings else Settings(),
+        crs=parse_crs(crs) if crs else None,
+        origin=origin,
+        workers=workers,
+        limit=limit,
+    )
+    failed = 0
+    for outcome in outcomes:
+        failed += outcome.summary is None
+        click.echo(outcome.line(), err=outcome.summary is None)
+    if failed:
+        sys.exit(1)
+
+
+@commands.command()
 @click.argument("result", type=FILE)
 @click.argument("reference", type=FILE)
 @click.option("--layer", help="Layer of REFERENCE; rows, or its only layer of lines, by default.")

@@ -24,6 +24,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 CORES = os.cpu_count() or 1
+"""Cores that this process works on."""
 FEW = 16
 """Items that one core has done before another would have begun."""
 _here = threading.local()
@@ -35,6 +36,12 @@ def compiled(function: F) -> F:
         return cast("F", njit(cache=True, nogil=True)(function))
     except RuntimeError:  # no folder for the cache can be written: compile anew each time
         return cast("F", njit(nogil=True)(function))
+
+
+def use_cores(n: int) -> None:
+    """Let this process work on so many cores, as others work beside it; before any work."""
+    global CORES  # noqa: PLW0603
+    CORES = n
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:

@@ -154,6 +154,7 @@ def map_parcel(
     origin: Origin | None = None,
     piece: Piece | None = None,
     inputs: Sequence[dict[str, Any]] = (),
+    share: float = 1.0,
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Map the rows and canopies of one parcel, and leave the product in a folder.
@@ -180,6 +181,8 @@ def map_parcel(
         The parcel's points, where the cloud was read before.
     inputs : sequence of dict, optional
         Fingerprints of cloud and boundary, where they are known.
+    share : float
+        Share of the memory that is this run's, where others run beside it.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -202,12 +205,12 @@ def map_parcel(
         return out
 
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
-    inputs = inputs or [fingerprint(path) for path in (cloud, boundary) if path]
+    inputs = list(inputs) or [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder) as draft:
         paths.tiles(draft).mkdir()
         collector = Collector(
             paths.tiles(draft),
-            most=settings.reading.max_points or _most_points(),
+            most=settings.reading.max_points or int(share * _most_points()),
             side=tile_side(settings.ground.resolution),
         )
         points: Cloud

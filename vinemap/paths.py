@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 DATA = Path("data")
+PIECES = ".pieces-"
+"""How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
 
 
@@ -34,9 +36,14 @@ def survey_boundaries(survey: str) -> Path:
     return DATA / "surveys" / survey / "parcels.gpkg"
 
 
+def survey_products(survey: str) -> Path:
+    """Folder of the products of a survey's parcels."""
+    return DATA / "products" / survey
+
+
 def product_folder(survey: str, parcel: str) -> Path:
     """Folder of a parcel's product."""
-    return DATA / "products" / survey / parcel
+    return survey_products(survey) / parcel
 
 
 def geopackage(folder: Path, parcel: str) -> Path:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 PARCEL_LAYER = "parcel"
+NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
 TEXT, WHOLE, REAL = "str", "int64", "float64"
 
 
@@ -148,6 +149,40 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     InputError
         If the file can't be read, has no polygon or no CRS, or none with the parcel's name.
     """
+    frame = _read_polygons(path)
+    if parcel is not None and len(frame) > 1:
+        columns = frame.drop(columns="geometry").astype(str)
+        named = frame[(columns == parcel).any(axis=1)]
+        if len(named) == 0:
+            words = sorted({word for name in columns for word in columns[name] if word not in ("None", "nan")})
+            close = difflib.get_close_matches(parcel, words, n=1, cutoff=0.5)
+            hint = f"did you mean {close[0]!r}?" if close else "check the name"
+            raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
+        frame = named
+    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy())))
+    if not np.isfinite(shapely.bounds(polygon)).all():
+        raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
+    return shapely.force_2d(polygon), frame.crs
+
+
+def parcel_names(path: Path) -> list[str]:
+    """Names of all parcels in a file of polygons: the first column, a likely one before others, that tells them apart.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, has no polygon or no CRS, or no column that has a name for each.
+    """
+    frame = _read_polygons(path)
+    columns = [name for name in frame.columns if name != "geometry"]
+    for name in sorted(columns, key=lambda name: str(name).lower() not in NAME_COLUMNS):
+        names = frame[name]
+        if not names.isna().any() and names.astype(str).is_unique and (names.astype(str).str.strip() != "").all():
+            return list(names.astype(str))
+    raise InputError(f"{path}: no column has a name of its own for each of its {len(frame)} polygons: add one, 'name'")
+
+
+def _read_polygons(path: Path) -> gpd.GeoDataFrame:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
@@ -164,19 +199,7 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
     if len(frame) == 0:
         raise InputError(f"{path}: holds no polygon")
-    if parcel is not None and len(frame) > 1:
-        columns = frame.drop(columns="geometry").astype(str)
-        named = frame[(columns == parcel).any(axis=1)]
-        if len(named) == 0:
-            words = sorted({word for name in columns for word in columns[name] if word not in ("None", "nan")})
-            close = difflib.get_close_matches(parcel, words, n=1, cutoff=0.5)
-            hint = f"did you mean {close[0]!r}?" if close else "check the name"
-            raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
-        frame = named
-    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy())))
-    if not np.isfinite(shapely.bounds(polygon)).all():
-        raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
-    return shapely.force_2d(polygon), frame.crs
+    return frame
 
 
 def _polygon_layer(path: Path) -> str:
