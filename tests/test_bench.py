@@ -2,6 +2,7 @@
 
 import json
 import math
+import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -44,6 +45,25 @@ def test_growth(exponent):
     runs = [grown(millions, exponent) for millions in (1, 2, 4, 16)]
     assert bench.growth_exponent([r.points for r in runs], [r.seconds["All"] for r in runs]) == pytest.approx(exponent)
     assert bench.growth_ratio(runs) == pytest.approx(8 ** (exponent - 1))
+
+
+def test_memory_of_processes_is_summed():
+    held = "x = bytearray(60_000_000); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(1.5)"
+    with bench.summed_memory() as most:
+        children = [subprocess.Popen([sys.executable, "-c", held]) for _ in range(2)]
+        for child in children:
+            child.wait()
+    if not Path("/proc/self/statm").is_file():
+        pytest.skip("needs /proc, which this system hasn't")
+    assert 120e6 < most[0] < 250e6
+    assert bench.resident(children[0].pid) == 0
+
+
+def test_a_survey_of_many_parcels(tmp_path):
+    (heading, line) = bench.many(0.15, 3, tmp_path)
+    assert line[0] == "0.2 M points, 3 parcels"
+    assert len(list((tmp_path / "products").glob("estate-*/*/run.json"))) == 3
+    assert len(heading) == len(line)
 
 
 def test_one_size_has_no_growth():
@@ -119,7 +139,7 @@ def test_the_document_is_filled(tmp_path):
 
 def test_the_page_has_a_place_for_every_table():
     page = (Path(__file__).parents[1] / "docs" / "speed.md").read_text(encoding="utf-8")
-    for name in ("machine", "bars", "stages", "instead", "prefect"):
+    for name in ("machine", "bars", "stages", "many", "instead", "prefect"):
         assert page.count(f"<!-- {name} -->") == page.count(f"<!-- /{name} -->") == 1
 
 
@@ -177,7 +197,7 @@ def test_no_flow_without_its_configuration(tmp_path, monkeypatch):
 
 
 def test_a_small_benchmark(tmp_path):
-    arguments = ["--sizes", "0.1", "--out", str(tmp_path), "--instead-at", "0.1", "--without", "prefect"]
+    arguments = ["--sizes", "0.1", "--out", str(tmp_path), "--instead-at", "0.1", "--without", "prefect", "--without", "many"]
     done = CliRunner().invoke(bench.main, arguments, catch_exceptions=False)
     assert done.exit_code == 0
     (cloud,) = (tmp_path / "surveys").glob("0.1M-*/0.1M-*.laz")

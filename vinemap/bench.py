@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import contextmanager
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,7 +29,7 @@ from vinemap.errors import ConfigError, VinemapError
 from vinemap.tables import as_markdown, as_text, fill
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 Lines = list[list[str]]
 """A table, headings first."""
@@ -57,6 +58,8 @@ GROWTH = 1.15
 BASE = 2e6
 LIMIT = 600.0
 """Seconds that an alternative may take."""
+MANY = 60.0, 20
+"""Million points and parcels of the survey that is one job."""
 EXAMPLE = Path("configs/barolo.yaml")
 LIBRARIES = ("numpy", "scipy", "numba", "laspy", "lazrs")
 
@@ -324,6 +327,67 @@ def instead(millions: float, run: Run, out: Path, *, limit: float = LIMIT) -> Li
     return lines
 
 
+def many(millions: float, parcels: int, out: Path) -> Lines:
+    """Table of a survey of many parcels in one job, and what it may take."""
+    click.echo(f"{millions:g} million points, {parcels} parcels…", err=True)
+    made, read = (out / "jobs" / f"{name}-{millions:g}M-{parcels}.json" for name in ("estate", "reading"))
+    must(job("estate", made, millions=millions, parcels=parcels, folder=str(out / "surveys")))
+    files = load(made)
+    must(job("reading", read, cloud=files["cloud"]))
+    products = out / "products" / f"estate-{millions:g}M"
+    command = [sys.executable, "-m", "vinemap.cli", "survey", files["cloud"], "--boundaries", files["boundaries"]]
+    with summed_memory() as most:
+        whole = must([*command, "--out", str(products)])
+    found = load(read)
+    seconds = Bar("", "", whole.seconds, 2.5 * found["seconds"], 1)
+    memory = of_bar(Bar("", "", most[0] / 1e6, 2000, 0)) if most[0] else "–"
+    return [
+        ["survey", "laspy.read, xyz", "one job", "all its processes' memory, MB"],
+        [
+            f"{found['points'] / 1e6:.1f} M points, {parcels} parcels",
+            f"{found['seconds']:.1f} s",
+            f"{of_bar(seconds)} s",
+            memory,
+        ],
+    ]
+
+
+@contextmanager
+def summed_memory() -> Iterator[list[int]]:
+    """Give what all processes begun meanwhile hold together (bytes), at the most; 0 where the system doesn't tell."""
+    most, done = [0], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.1):
+            most[0] = max(most[0], sum(map(resident, descendants(os.getpid()))))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield most
+    finally:
+        done.set()
+        watcher.join()
+
+
+def descendants(process: int) -> list[int]:
+    """Processes that a process has begun, and those that they have."""
+    try:
+        files = list(Path(f"/proc/{process}/task").glob("*/children"))
+        children = [int(word) for file in files for word in file.read_text().split()]
+    except OSError:
+        return []
+    return children + [one for child in children for one in descendants(child)]
+
+
+def resident(process: int) -> int:
+    """Memory (bytes) that a process holds; 0 if it has gone."""
+    try:
+        return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
+
+
 def prefect(out: Path) -> Lines:
     """Table of what a flow adds to the command: parcel F of the example, the second run of each.
 
@@ -423,7 +487,7 @@ def write_tables(tables: Mapping[str, Lines], path: Path) -> None:
 @click.option("--out", type=FILE, default=Path("build/bench"), show_default=True, help="Folder of all that is made.")
 @click.option("--docs", type=FILE, help="Markdown file to fill between its marks; the plot goes beside it.")
 @click.option("--instead-at", default=4.0, show_default=True, help="Million points for what a user would pick instead.")
-@click.option("--without", multiple=True, type=click.Choice(["instead", "prefect"]), help="What to leave out.")
+@click.option("--without", multiple=True, type=click.Choice(["many", "instead", "prefect"]), help="What to leave out.")
 def main(sizes: str, out: Path, docs: Path | None, instead_at: float, without: Iterable[str]) -> None:
     """Measure seconds and memory of the chain on simulated parcels of several sizes."""
     millions = parse_sizes(sizes)
@@ -433,6 +497,8 @@ def main(sizes: str, out: Path, docs: Path | None, instead_at: float, without: I
         runs.append(measure(size, out))
     (out / "runs.json").write_text(json.dumps([run._asdict() for run in runs], indent=2), encoding="utf-8")
     tables = {"bars": bar_table(runs), "stages": stage_table(runs)}
+    if "many" not in without:
+        tables["many"] = many(*MANY, out)
     if "instead" not in without:
         k = min(range(len(runs)), key=lambda i: abs(millions[i] - instead_at))
         tables["instead"] = instead(millions[k], runs[k], out)

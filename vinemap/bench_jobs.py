@@ -94,6 +94,43 @@ def survey(millions: float, folder: str) -> dict[str, Any]:
     return {"cloud": str(cloud), "boundary": str(boundary), "truth": str(truth), "area": area}
 
 
+def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
+    """Simulate a survey of that size with many parcels, some way apart, unless it is there."""
+    import laspy
+    import pandas as pd
+
+    from vinemap import synthetic
+    from vinemap.crs import parse_crs
+
+    source = "".join(inspect.getsource(part) for part in (plot, estate, synthetic))
+    name = f"{millions:g}M-{parcels}-{zlib.crc32(f'{source}{DENSITY}{SPACING}'.encode()):08x}"
+    cloud = Path(folder, name, f"{name}.laz")
+    boundary = cloud.with_name("parcels.gpkg")
+    if not cloud.is_file():
+        cloud.parent.mkdir(parents=True, exist_ok=True)
+        header = laspy.LasHeader(version="1.4", point_format=6)
+        header.scales, header.offsets = np.full(3, 0.001), np.array([414_000.0, 4_940_000.0, 300.0])
+        header.add_crs(parse_crs("EPSG:32632"))
+        draft, polygons = cloud.with_suffix(".part"), []
+        made = plot(millions / parcels)
+        apart = np.ptp(np.concatenate(made.rows), axis=0).max() + 30
+        with laspy.open(draft, mode="w", header=header, do_compress=True) as writer:
+            for k in range(parcels):
+                shift = apart * np.array(divmod(k, 5))
+                rows = [row + shift for row in made.rows]
+                vineyard = synthetic.Vineyard(f"{k + 1}", rows, gaps=made.vineyard.gaps)
+                found = synthetic.simulate(
+                    [vineyard], made.terrain, density=DENSITY, density_outside=DENSITY_OUTSIDE, seed=k
+                )
+                points = laspy.ScaleAwarePointRecord.zeros(len(found.xyz), header=header)
+                points.x, points.y, points.z = found.xyz.T
+                writer.write_points(points)
+                polygons.append(found.parcels)
+        pd.concat(polygons).to_file(boundary, layer="parcels")
+        draft.replace(cloud)
+    return {"cloud": str(cloud), "boundaries": str(boundary)}
+
+
 def reading(cloud: str) -> dict[str, Any]:
     """Seconds of plain laspy until the coordinates are there, best of three."""
     import laspy
@@ -313,7 +350,7 @@ def memory_since(before: int | None) -> str:
     return "" if most is None or before is None else f"; {max(most - before, 0) / 1e9:.1f} GB"
 
 
-OURS = survey, reading, peaks
+OURS = survey, estate, reading, peaks
 INSTEAD = ground, rows, polygons
 JOBS: Mapping[str, Callable[..., dict[str, Any]]] = {job.__name__: job for job in OURS + INSTEAD}
 
