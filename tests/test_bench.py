@@ -197,7 +197,18 @@ def test_no_flow_without_its_configuration(tmp_path, monkeypatch):
 
 
 def test_a_small_benchmark(tmp_path):
-    arguments = ["--sizes", "0.1", "--out", str(tmp_path), "--instead-at", "0.1", "--without", "prefect", "--without", "many"]
+    arguments = [
+        "--sizes",
+        "0.1",
+        "--out",
+        str(tmp_path),
+        "--instead-at",
+        "0.1",
+        "--without",
+        "prefect",
+        "--without",
+        "many",
+    ]
     done = CliRunner().invoke(bench.main, arguments, catch_exceptions=False)
     assert done.exit_code == 0
     (cloud,) = (tmp_path / "surveys").glob("0.1M-*/0.1M-*.laz")

@@ -182,9 +182,12 @@ def _take_flagged(
     old: tuple[Values, Values, NDArray[np.int32]],
     new: tuple[Values, Values, NDArray[np.int32]],
 ) -> None:
+    points, height, member = old
+    kept, kept_height, kept_member = new
     for k in range(first, last):
         at = place[k]
         for p in range(start[k], start[k + 1]):
             if flags[p]:
-                new[0][at], new[1][at], new[2][at] = old[0][p], old[1][p], old[2][p]
+                kept[at, 0], kept[at, 1] = points[p, 0], points[p, 1]  # a row at once would be far slower
+                kept_height[at], kept_member[at] = height[p], member[p]
                 at += 1

@@ -8,6 +8,7 @@ import geopandas as gpd
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from vinemap.compiled import in_threads
 from vinemap.raster import cell_of, sample, sample_across
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.floating]
 
-BATCH = 20_000
+BATCH = 5_000
 SLICES = 3
 """Lines across the rows that are averaged in a slice."""
 
@@ -64,15 +65,16 @@ def detect_key_points(
         PointZ with columns ``cover`` (0–1), ``direction_deg`` and ``spacing_m`` of the field there.
     """
     nodes = _nodes(field, cover.grid, grid_step, min_likelihood)
-    found: list[Values] = [np.empty((0, 5))]
-    for start in range(0, len(nodes), BATCH):
-        batch = nodes[start : start + BATCH]
+
+    def maxima(batch: Values) -> Values:
         # Beyond its reach a profile goes on for what the Gaussian needs.
         margin = 4 * smoothing + bin_width
         profile, offsets = _profiles(cover, batch, reach * batch[:, 3].max() + margin, slice_width, bin_width)
         profile = gaussian_filter1d(profile, smoothing / bin_width, axis=1)
-        found.append(_maxima(profile, offsets, batch, reach, min_cover))
-    points = np.concatenate(found)
+        return _maxima(profile, offsets, batch, reach, min_cover)
+
+    batches = [nodes[start : start + BATCH] for start in range(0, len(nodes), BATCH)]
+    points = np.concatenate([np.empty((0, 5)), *in_threads(maxima, batches)])
     z = sample(dtm, points[:, :2]) if len(points) else np.empty(0)
     return gpd.GeoDataFrame(
         {"cover": points[:, 2], "direction_deg": points[:, 3], "spacing_m": points[:, 4]},

@@ -80,18 +80,16 @@ def cut_sections(
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
-        canopy = float(np.count_nonzero((height >= low) & (height <= high) & (np.abs(left) < HALF)))
+        canopy, soil = _count(left, height, low, high)
         length = max(len(position) * step, step)
-        a = max(width, min(max_width, min_points * length / max(canopy, 1.0)))
-        soil = np.abs(height) < SOIL
-        every = max(1, int(np.count_nonzero(soil) * a / length / SOIL_POINTS))
-        if every > 1:
-            # Chosen by their place, so that the points' order doesn't matter.
-            kept = ~soil | (np.floor(1000 * along) % every == 0)
-            along, left, member, elevation, height = (v[kept] for v in (along, left, member, elevation, height))
-        n, index = _members(along, position, a / 2)
+        a = max(width, min(max_width, min_points * length / max(canopy, 1)))
+        every = max(1, int(soil * a / length / SOIL_POINTS))
+        n, index = _members(along, height, position, a / 2, every)
+        start = np.concatenate([[0], np.cumsum(n)])
         here = at(curves[row], position)
         level = sample(dtm, here)
+        points = np.empty((start[-1], 2))
+        _fill(index, left, elevation, start, level, points)
         return then(
             Sections(
                 np.full(len(position), numbers[row]),
@@ -99,8 +97,8 @@ def cut_sections(
                 np.column_stack([here, level]),
                 tangents(curves[row], position),
                 np.full(len(position), spacing[row]),
-                np.concatenate([[0], np.cumsum(n)]),
-                np.column_stack([left[index], elevation[index] - np.repeat(level, n)]),
+                start,
+                points,
                 height[index],
                 member[index],
             )
@@ -137,8 +135,23 @@ def _take(
 
 
 @compiled
-def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """How many points (m,) lie within reach of each position along a row, and which, section after section."""
+def _count(left: Values, height: Values, low: float, high: float) -> tuple[int, int]:
+    """Points (n,) of the canopy, and of the soil."""
+    canopy, soil = 0, 0
+    for p in range(len(left)):
+        canopy += low <= height[p] <= high and abs(left[p]) < HALF
+        soil += abs(height[p]) < SOIL
+    return canopy, soil
+
+
+@compiled
+def _members(
+    along: Values, height: Values, position: Values, reach: float, every: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """How many points (m,) lie within reach of each position along a row, and which, section after section.
+
+    Of the soil's one in so many: chosen by its place, so that the points' order doesn't matter.
+    """
     m = len(position)
     n = np.zeros(m, dtype=np.int64)
     if m == 0:
@@ -147,6 +160,9 @@ def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.
     table = np.searchsorted(position, position[0] + step * np.arange(int((position[-1] - position[0]) / step) + 2))
     first = np.empty(len(along), dtype=np.int32)
     for p in range(len(along)):
+        if abs(height[p]) < SOIL and int(1000 * along[p]) % every != 0:
+            first[p] = m
+            continue
         bin_ = int((along[p] - reach - position[0]) / step)
         k = table[min(max(bin_, 0), len(table) - 1)]
         while k < m and position[k] < along[p] - reach:
@@ -164,6 +180,21 @@ def _members(along: Values, position: Values, reach: float) -> tuple[NDArray[np.
             place[k] += 1
             k += 1
     return n, out
+
+
+@compiled
+def _fill(
+    index: NDArray[np.int32],
+    left: Values,
+    elevation: Values,
+    start: NDArray[np.int64],
+    level: Values,
+    points: Values,
+) -> None:
+    """Write the points (n, 2) of sections whose soil lies at ``level`` (m,)."""
+    for k in range(len(level)):
+        for i in range(start[k], start[k + 1]):
+            points[i, 0], points[i, 1] = left[index[i]], elevation[index[i]] - level[k]
 
 
 def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:

@@ -106,9 +106,15 @@ def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) ->
     out, place = np.empty((start[-1], 3)), start[:-1].copy()
     for p in range(len(label)):
         if label[p] >= 0:
-            out[place[label[p]]] = xyz[p]
-            place[label[p]] += 1
+            _copy(xyz, p, out, place, label[p])
     for q in range(len(into)):
-        out[place[into[q]]] = xyz[again[q]]
-        place[into[q]] += 1
+        _copy(xyz, again[q], out, place, into[q])
     return out, start
+
+
+@compiled
+def _copy(xyz: Points, p: int, out: Points, place: Indices, zone: int) -> None:
+    """Write point p to its zone's place, and move that on; a row at once would be far slower."""
+    at = place[zone]
+    out[at, 0], out[at, 1], out[at, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
+    place[zone] = at + 1
