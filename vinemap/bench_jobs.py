@@ -39,6 +39,8 @@ DENSITY = 500.0
 DENSITY_OUTSIDE = 60.0
 SPACING = 2.7
 """Metres between rows."""
+MARGIN = 13.0
+"""Metres of bare ground about the rows: half of parcel F is such."""
 CANOPY = (0.5, 2.9)
 """Heights (m) above ground between which a point is one of canopy."""
 OUTLINE = 30
@@ -59,18 +61,26 @@ class Plot(NamedTuple):
 def plot(millions: float) -> Plot:
     """Parcel on which about so many million points are found: number and length of rows grow with its square root.
 
-    Rows are 2.7 m apart on a bend of 800 m radius and a slope of 15%: 28 rows of 98 m where 4 million points lie.
+    Rows are 2.7 m apart on a bend of 800 m radius and a slope of 15%, with bare ground about them: 16 rows of 112 m on a
+    hectare where 4.7 million points lie, as in parcel F.
     """
     from vinemap.scenes import hillside, rows_of
     from vinemap.synthetic import Vineyard
 
-    n = max(round(14 * math.sqrt(millions)), 3)
-    width = (n - 1) * SPACING + 6
+    n = max(round(7.4 * math.sqrt(millions)), 3)
+    width = (n - 1) * SPACING + 2 * MARGIN
     edge = 2 * 6 * DENSITY_OUTSIDE
-    length = (1e6 * millions - edge * width) / (0.94 * DENSITY * width + edge) - 6
+    length = (1e6 * millions - edge * width) / (0.94 * DENSITY * width + edge) - 2 * MARGIN
     rows = rows_of(n, length=max(length, 5.0), spacing=SPACING, azimuth=18, radius=800)
     gaps = (2, 3, 3, 4, 5) * math.ceil(n / 24)
-    return Plot(rows, Vineyard("F", rows, gaps=gaps), hillside(0.15, uphill=100))
+    return Plot(rows, Vineyard("F", rows, gaps=gaps, outline=outline(rows)), hillside(0.15, uphill=100))
+
+
+def outline(rows: list[Array]) -> shapely.Polygon:
+    """Parcel of rows and the bare ground about them."""
+    import shapely
+
+    return shapely.MultiLineString(rows).convex_hull.buffer(MARGIN)
 
 
 def survey(millions: float, folder: str) -> dict[str, Any]:
@@ -79,8 +89,8 @@ def survey(millions: float, folder: str) -> dict[str, Any]:
 
     from vinemap import scenes, synthetic
 
-    source = "".join(inspect.getsource(part) for part in (plot, scenes.rows_of, scenes.hillside, synthetic))
-    recipe = zlib.crc32(f"{source}{DENSITY}{DENSITY_OUTSIDE}{SPACING}".encode())
+    source = "".join(inspect.getsource(part) for part in (plot, outline, scenes.rows_of, scenes.hillside, synthetic))
+    recipe = zlib.crc32(f"{source}{DENSITY}{DENSITY_OUTSIDE}{SPACING}{MARGIN}".encode())
     name = f"{millions:g}M-{recipe:08x}"
     cloud = Path(folder, name, f"{name}.laz")
     if not cloud.is_file():
@@ -102,7 +112,7 @@ def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
     from vinemap import synthetic
     from vinemap.crs import parse_crs
 
-    source = "".join(inspect.getsource(part) for part in (plot, estate, synthetic))
+    source = "".join(inspect.getsource(part) for part in (plot, outline, estate, synthetic))
     name = f"{millions:g}M-{parcels}-{zlib.crc32(f'{source}{DENSITY}{SPACING}'.encode()):08x}"
     cloud = Path(folder, name, f"{name}.laz")
     boundary = cloud.with_name("parcels.gpkg")
@@ -113,12 +123,12 @@ def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
         header.add_crs(parse_crs("EPSG:32632"))
         draft, polygons = cloud.with_suffix(".part"), []
         made = plot(millions / parcels)
-        apart = np.ptp(np.concatenate(made.rows), axis=0).max() + 30
+        apart = np.ptp(np.concatenate(made.rows), axis=0).max() + 2 * MARGIN + 10
         with laspy.open(draft, mode="w", header=header, do_compress=True) as writer:
             for k in range(parcels):
                 shift = apart * np.array(divmod(k, 5))
                 rows = [row + shift for row in made.rows]
-                vineyard = synthetic.Vineyard(f"{k + 1}", rows, gaps=made.vineyard.gaps)
+                vineyard = synthetic.Vineyard(f"{k + 1}", rows, gaps=made.vineyard.gaps, outline=outline(rows))
                 found = synthetic.simulate(
                     [vineyard], made.terrain, density=DENSITY, density_outside=DENSITY_OUTSIDE, seed=k
                 )
