@@ -40,7 +40,7 @@ DENSITY_OUTSIDE = 60.0
 SPACING = 2.7
 """Metres between rows."""
 MARGIN = 13.0
-"""Metres of bare ground about the rows: half of parcel F is such."""
+"""Metres of bare ground about the rows, less about few: half of parcel F is such."""
 CANOPY = (0.5, 2.9)
 """Heights (m) above ground between which a point is one of canopy."""
 OUTLINE = 30
@@ -61,26 +61,32 @@ class Plot(NamedTuple):
 def plot(millions: float) -> Plot:
     """Parcel on which about so many million points are found: number and length of rows grow with its square root.
 
-    Rows are 2.7 m apart on a bend of 800 m radius and a slope of 15%, with bare ground about them: 16 rows of 112 m on a
-    hectare where 4.7 million points lie, as in parcel F.
+    Rows are 2.7 m apart on a bend of 800 m radius and a slope of 15%, with bare ground about them: 16 rows of 112 m on
+    a hectare where 4.7 million points lie, as in parcel F.
     """
     from vinemap.scenes import hillside, rows_of
     from vinemap.synthetic import Vineyard
 
     n = max(round(7.4 * math.sqrt(millions)), 3)
-    width = (n - 1) * SPACING + 2 * MARGIN
+    margin = margin_of(millions)
+    width = (n - 1) * SPACING + 2 * margin
     edge = 2 * 6 * DENSITY_OUTSIDE
-    length = (1e6 * millions - edge * width) / (0.94 * DENSITY * width + edge) - 2 * MARGIN
+    length = (1e6 * millions - edge * width) / (0.94 * DENSITY * width + edge) - 2 * margin
     rows = rows_of(n, length=max(length, 5.0), spacing=SPACING, azimuth=18, radius=800)
     gaps = (2, 3, 3, 4, 5) * math.ceil(n / 24)
-    return Plot(rows, Vineyard("F", rows, gaps=gaps, outline=outline(rows)), hillside(0.15, uphill=100))
+    return Plot(rows, Vineyard("F", rows, gaps=gaps, outline=outline(rows, margin)), hillside(0.15, uphill=100))
 
 
-def outline(rows: list[Array]) -> shapely.Polygon:
-    """Parcel of rows and the bare ground about them."""
+def margin_of(millions: float) -> float:
+    """Metres of bare ground about the rows of a parcel on which about so many million points are found."""
+    return MARGIN * min(1.0, math.sqrt(millions / 4.7))
+
+
+def outline(rows: list[Array], margin: float) -> shapely.Polygon:
+    """Parcel of rows and the bare ground about them (m)."""
     import shapely
 
-    return shapely.MultiLineString(rows).convex_hull.buffer(MARGIN)
+    return shapely.MultiLineString(rows).convex_hull.buffer(margin)
 
 
 def survey(millions: float, folder: str) -> dict[str, Any]:
@@ -89,7 +95,9 @@ def survey(millions: float, folder: str) -> dict[str, Any]:
 
     from vinemap import scenes, synthetic
 
-    source = "".join(inspect.getsource(part) for part in (plot, outline, scenes.rows_of, scenes.hillside, synthetic))
+    source = "".join(
+        inspect.getsource(part) for part in (plot, outline, margin_of, scenes.rows_of, scenes.hillside, synthetic)
+    )
     recipe = zlib.crc32(f"{source}{DENSITY}{DENSITY_OUTSIDE}{SPACING}{MARGIN}".encode())
     name = f"{millions:g}M-{recipe:08x}"
     cloud = Path(folder, name, f"{name}.laz")
@@ -108,12 +116,13 @@ def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
     """Simulate a survey of that size with many parcels, some way apart, unless it is there."""
     import laspy
     import pandas as pd
+    from shapely import affinity
 
     from vinemap import synthetic
     from vinemap.crs import parse_crs
 
-    source = "".join(inspect.getsource(part) for part in (plot, outline, estate, synthetic))
-    name = f"{millions:g}M-{parcels}-{zlib.crc32(f'{source}{DENSITY}{SPACING}'.encode()):08x}"
+    source = "".join(inspect.getsource(part) for part in (plot, outline, margin_of, estate, synthetic))
+    name = f"{millions:g}M-{parcels}-{zlib.crc32(f'{source}{DENSITY}{DENSITY_OUTSIDE}{SPACING}{MARGIN}'.encode()):08x}"
     cloud = Path(folder, name, f"{name}.laz")
     boundary = cloud.with_name("parcels.gpkg")
     if not cloud.is_file():
@@ -123,12 +132,14 @@ def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
         header.add_crs(parse_crs("EPSG:32632"))
         draft, polygons = cloud.with_suffix(".part"), []
         made = plot(millions / parcels)
+        hull = outline(made.rows, margin_of(millions / parcels))
         apart = np.ptp(np.concatenate(made.rows), axis=0).max() + 2 * MARGIN + 10
         with laspy.open(draft, mode="w", header=header, do_compress=True) as writer:
             for k in range(parcels):
                 shift = apart * np.array(divmod(k, 5))
                 rows = [row + shift for row in made.rows]
-                vineyard = synthetic.Vineyard(f"{k + 1}", rows, gaps=made.vineyard.gaps, outline=outline(rows))
+                where = affinity.translate(hull, *shift)
+                vineyard = synthetic.Vineyard(f"{k + 1}", rows, gaps=made.vineyard.gaps, outline=where)
                 found = synthetic.simulate(
                     [vineyard], made.terrain, density=DENSITY, density_outside=DENSITY_OUTSIDE, seed=k
                 )
