@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SOIL, SOIL_POINTS = 0.3, 100
+SOIL, SOIL_POINTS = 0.3, 200
 """Metres from the terrain within which points are the soil's, and how many of them, about, a section needs: dense
 clouds have many more, which would tell no more of the inter-row's elevation."""
 HALF = 0.9
