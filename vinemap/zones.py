@@ -82,7 +82,9 @@ def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
         label[inside[~taken]] = k
         again.append(inside[taken])
         into.append(np.full(np.count_nonzero(taken), k, dtype=np.int32))
-    return _gather(xyz, label, np.concatenate(again), np.concatenate(into), len(zones.polygons))
+    shared, others = np.concatenate(again), np.concatenate(into)
+    order = np.argsort(shared, kind="stable")
+    return _gather(xyz, label, shared[order], others[order], len(zones.polygons))
 
 
 @compiled
@@ -95,7 +97,7 @@ def _look_up(xyz: Points, grid: Grid, code: Labels, label: Labels) -> None:
 
 @compiled
 def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) -> tuple[Points, Indices]:
-    """Points by label (n,), and those ``again`` that a further polygon holds, behind its others."""
+    """Points by label (n,), and those ``again``, in climbing order, that a further polygon holds too."""
     start = np.zeros(k + 1, dtype=np.int64)
     for zone in label:
         if zone >= 0:
@@ -104,11 +106,13 @@ def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) ->
         start[zone + 1] += 1
     start = np.cumsum(start)
     out, place = np.empty((start[-1], 3)), start[:-1].copy()
+    q = 0
     for p in range(len(label)):
         if label[p] >= 0:
             out[place[label[p]]] = xyz[p]
             place[label[p]] += 1
-    for q in range(len(into)):
-        out[place[into[q]]] = xyz[again[q]]
-        place[into[q]] += 1
+        while q < len(again) and again[q] == p:
+            out[place[into[q]]] = xyz[p]
+            place[into[q]] += 1
+            q += 1
     return out, start
