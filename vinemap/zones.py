@@ -9,7 +9,7 @@ import shapely
 from scipy.ndimage import binary_dilation
 
 from vinemap.compiled import compiled
-from vinemap.raster import Grid
+from vinemap.raster import Grid, window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,18 +43,17 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
     # A cell more on each side, so that what lies on an outline never falls off the raster.
     grid = Grid(west - cell, north + cell, cell, int((north - south) / cell) + 3, int((east - west) / cell) + 3)
     code = np.full(grid.shape, NOWHERE, dtype=np.int32)
-    x, y = grid.centres()
     for k, polygon in enumerate(polygons):
-        inside = np.zeros(grid.shape, dtype=bool)
-        west, south, east, north = shapely.bounds(polygon)
-        near = np.ix_(np.flatnonzero((y >= south) & (y <= north)), np.flatnonzero((x >= west) & (x <= east)))
-        inside[near] = shapely.contains_xy(polygon, *(v[near] for v in np.meshgrid(x, y)))
+        corners = np.reshape(shapely.bounds(polygon), (2, 2))
+        part, where = window(grid, corners[0] - 2 * cell, corners[1] + 2 * cell)
+        inside = shapely.contains_xy(polygon, *np.meshgrid(*part.centres()))
         line = shapely.get_coordinates(shapely.segmentize(shapely.boundary(polygon), cell))
-        edge = np.zeros(grid.shape, dtype=bool)
-        edge[((grid.north - line[:, 1]) / cell).astype(int), ((line[:, 0] - grid.west) / cell).astype(int)] = True
+        edge = np.zeros(part.shape, dtype=bool)
+        edge[((part.north - line[:, 1]) / cell).astype(int), ((line[:, 0] - part.west) / cell).astype(int)] = True
         edge = binary_dilation(edge, np.ones((3, 3)))
-        code[inside] = np.where(code[inside] == NOWHERE, k, ASK)
-        code[edge] = ASK
+        here = code[where]
+        here[inside] = np.where(here[inside] == NOWHERE, k, ASK)
+        here[edge] = ASK
     return Zones(polygons, grid, code)
 
 
