@@ -6,6 +6,7 @@ import pytest
 import shapely
 from pyproj import CRS, Transformer
 
+from vinemap import las
 from vinemap.crs import parse_crs
 from vinemap.errors import InputError
 from vinemap.las import read_cloud
@@ -13,23 +14,25 @@ from vinemap.las import read_cloud
 UTM = CRS.from_epsg(32632)
 
 
-def write_las(path, xyz, crs=UTM, scales=(0.001, 0.001, 0.001), classification=None, point_format=6):
+def write_las(path, xyz, crs=UTM, scales=(0.001, 0.001, 0.001), classification=None, point_format=6, withheld=None):
     header = laspy.LasHeader(point_format=point_format, version="1.4")
     header.scales = np.array(scales)
     header.offsets = np.floor(xyz.min(axis=0)) if len(xyz) else np.zeros(3)
     if crs is not None:
         header.add_crs(crs)
-    las = laspy.LasData(header)
-    las.xyz = xyz
+    data = laspy.LasData(header)
+    data.xyz = xyz
     if classification is not None:
-        las.classification = classification
-    las.write(path)
+        data.classification = classification
+    if withheld is not None:
+        data.withheld = withheld
+    data.write(path)
     return path
 
 
 @pytest.fixture
 def points():
-    return np.random.default_rng(0).uniform([414700, 4940700, 460], [414760, 4940750, 470], (5000, 3))
+    return np.random.default_rng(0).uniform([414700, 4940700, 460], [414760, 4940750, 470], (5000, 3)).round(3)
 
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
@@ -39,30 +42,148 @@ def test_reads_las_and_laz(tmp_path, points, suffix):
     assert np.allclose(cloud.xyz, points, atol=0.0006)
 
 
-def test_reads_copc(tmp_path, points):
-    copclib = pytest.importorskip("copclib")
-    offset = copclib.Vector3(*np.floor(points.min(axis=0)))
-    config = copclib.CopcConfigWriter(7, copclib.Vector3(0.001, 0.001, 0.001), offset, UTM.to_wkt())
-    config.las_header.min, config.las_header.max = (
-        copclib.Vector3(*corner) for corner in (points.min(axis=0), points.max(axis=0))
-    )
-    config.copc_info.spacing = 10
-    path = tmp_path / "a.copc.laz"
+def write_copc(path, xyz, *, crs=UTM, scales=(0.001, 0.001, 0.001), levels=4, noise=(), withheld=()):
+    """Write points (n, 3) to nodes of an octree of so many levels, chosen at random."""
+    copclib = pytest.importorskip("copclib", reason="copclib, which writes COPC files, is not on this machine")
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    middle, half = (low + high) / 2, 0.50001 * np.ptp(xyz, axis=0).max()
+    config = copclib.CopcConfigWriter(7, copclib.Vector3(*scales), copclib.Vector3(*np.floor(low)), crs.to_wkt())
+    config.las_header.min, config.las_header.max = copclib.Vector3(*low), copclib.Vector3(*high)
+    info = config.copc_info
+    info.spacing, info.halfsize = 10, half
+    info.center_x, info.center_y, info.center_z = middle
     writer = copclib.FileWriter(str(path), config)
-    # A root node and one of its children, which a plain reader of LAZ must find as well.
-    for key, part in (((0, 0, 0, 0), points[:1000]), ((1, 0, 0, 0), points[1000:3000])):
+    level = np.random.default_rng(0).integers(0, levels, len(xyz))
+    place = (xyz - middle + half) / (2 * half) * 2.0 ** level[:, None]
+    keys = np.column_stack([level, place.astype(int)])
+    for key in np.unique(keys, axis=0):
         node = copclib.Points(writer.copc_config.las_header)
-        for x, y, z in part:
+        for k in np.flatnonzero((keys == key).all(axis=1)):
             point = node.CreatePoint()
-            point.x, point.y, point.z = x, y, z
+            point.x, point.y, point.z = xyz[k]
+            point.classification, point.withheld = 7 if k in noise else 2, k in withheld
             node.AddPoint(point)
-        writer.AddNode(copclib.VoxelKey(*key), node)
+        writer.AddNode(copclib.VoxelKey(*key.tolist()), node)
     writer.Close()
-    cloud = read_cloud(path)
+    return path
+
+
+def in_order(xyz):
+    return xyz[np.lexsort(xyz.round(3).T)]
+
+
+def index_of(path):
+    """Where the root page of a COPC file's index lies."""
+    from laspy import CopcReader
+
+    with CopcReader.open(path) as reader:
+        begin = reader.copc_info.hierarchy_root_offset
+        return begin, begin + reader.copc_info.hierarchy_root_size
+
+
+@pytest.fixture
+def through(monkeypatch):
+    """Read through what would be queried by box."""
+
+    def read(*args, **kwargs):
+        with monkeypatch.context() as patch:
+            patch.setattr(las, "SMALL", 0.0)
+            return read_cloud(*args, **kwargs)
+
+    return read
+
+
+@pytest.fixture
+def queried(monkeypatch):
+    """Read, and fail where a file is read through."""
+
+    def read(*args, **kwargs):
+        with monkeypatch.context() as patch:
+            patch.delattr(laspy.LasReader, "chunk_iterator")
+            return read_cloud(*args, **kwargs)
+
+    return read
+
+
+CORNER = shapely.Polygon([(414701, 4940702), (414723, 4940707), (414712, 4940722)])
+
+
+def test_reads_copc(tmp_path, points):
+    cloud = read_cloud(write_copc(tmp_path / "a.copc.laz", points))
     assert cloud.crs == UTM
-    assert len(cloud.xyz) == 3000
-    order = [xyz[np.lexsort(xyz.T)] for xyz in (cloud.xyz.round(3), points[:3000].round(3))]
-    assert np.allclose(*order, atol=0.0011)
+    assert np.allclose(in_order(cloud.xyz), in_order(points), atol=0.0011)
+
+
+@pytest.mark.parametrize("levels", [1, 4])
+def test_a_box_of_a_copc_is_what_reading_through_gives(tmp_path, points, queried, through, levels):
+    path = write_copc(tmp_path / "a.copc.laz", points, levels=levels)
+    found, clipped = (in_order(read(path, boundary=(CORNER, UTM)).xyz) for read in (queried, through))
+    assert np.array_equal(found, clipped)
+    inside = in_order(points[shapely.contains_xy(CORNER, points[:, :2])])
+    assert len(inside) > 250
+    assert np.allclose(found, inside, atol=1e-6)
+
+
+def test_a_box_of_a_copc_in_degrees(tmp_path, points, queried, through):
+    lon, lat = Transformer.from_crs(32632, 4326, always_xy=True).transform(points[:, 0], points[:, 1])
+    degrees = np.column_stack([lon, lat, points[:, 2]])
+    path = write_copc(tmp_path / "a.copc.laz", degrees, crs=CRS.from_epsg(4326), scales=(1e-9, 1e-9, 0.001))
+    found, clipped = (read(path, boundary=(CORNER, UTM)) for read in (queried, through))
+    assert found.crs == clipped.crs == UTM
+    assert np.array_equal(in_order(found.xyz), in_order(clipped.xyz))
+    assert len(found.xyz) == pytest.approx(shapely.contains_xy(CORNER, points[:, :2]).sum(), abs=2)
+
+
+def test_noise_and_withheld_points_of_a_box_are_left_out(tmp_path, points, queried):
+    inside = np.flatnonzero(shapely.contains_xy(CORNER, points[:, :2]))
+    path = write_copc(tmp_path / "a.copc.laz", points, noise=set(inside[:10]), withheld=set(inside[10:30]))
+    found = queried(path, boundary=(CORNER, UTM)).xyz
+    assert np.allclose(in_order(found), in_order(points[inside[30:]]), atol=0.0011)
+
+
+def test_a_wide_polygon_or_too_many_points_are_read_through(tmp_path, points, queried, monkeypatch):
+    path = write_copc(tmp_path / "a.copc.laz", points)
+    wide = shapely.box(414705, 4940705, 414755, 4940745)
+    with pytest.raises(InputError, match="chunk_iterator"):
+        queried(path, boundary=(wide, UTM))
+    monkeypatch.setattr(las, "MOST_FOUND", 1000)
+    with pytest.raises(InputError, match="chunk_iterator"):
+        queried(path, boundary=(CORNER, UTM))
+
+
+@pytest.mark.parametrize("broken", ["zeros", "ones", "half", "swapped"])
+def test_a_copc_with_a_broken_index_is_read_through(tmp_path, points, broken):
+    path = write_copc(tmp_path / "a.copc.laz", points)
+    whole = read_cloud(path, boundary=(CORNER, UTM)).xyz
+    data, (begin, end) = path.read_bytes(), index_of(path)
+    index = data[begin:end]
+    index = {
+        "zeros": bytes(len(index)),
+        "ones": b"\xff" * len(index),
+        "half": index[: len(index) // 64 * 32] + bytes(len(index) - len(index) // 64 * 32),
+        "swapped": index[::-1],
+    }[broken]
+    path.write_bytes(data[:begin] + index + data[end:])
+    assert np.array_equal(in_order(read_cloud(path, boundary=(CORNER, UTM)).xyz), in_order(whole))
+
+
+@pytest.mark.parametrize("part", [0.3, 0.7])
+def test_a_copc_cut_short(tmp_path, points, part):
+    path = write_copc(tmp_path / "a.copc.laz", points)
+    path.write_bytes(path.read_bytes()[: int(part * index_of(path)[0])])
+    for boundary in (None, (CORNER, UTM)):
+        with pytest.raises(InputError, match=r"a\.copc\.laz: ends before .* copy or download it again"):
+            read_cloud(path, boundary=boundary, crs=UTM)
+
+
+@pytest.mark.parametrize("suffix", ["laz", "copc.laz"])
+@pytest.mark.parametrize("away", [(70.0, 0.0), (0.0, 1e7), (-414700.0, -4940700.0)])
+def test_polygon_beside_the_cloud(tmp_path, points, suffix, away):
+    write = write_copc if suffix == "copc.laz" else write_las
+    path = write(tmp_path / f"a.{suffix}", points)
+    beside = shapely.transform(CORNER, lambda xy: xy + away)
+    with pytest.raises(InputError, match=r"a\..*laz: no point lies inside the boundary"):
+        read_cloud(path, boundary=(beside, UTM))
 
 
 def test_clips_to_a_polygon_in_another_crs(tmp_path, points):
@@ -104,6 +225,39 @@ def test_noise_classes_and_strays_are_left_out(tmp_path, points):
     classes[10:20] = 7
     cloud = read_cloud(write_las(tmp_path / "a.laz", points, classification=classes))
     assert len(cloud.xyz) == len(points) - 12
+
+
+@pytest.mark.parametrize("point_format", [3, 6])
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_withheld_points_are_left_out(tmp_path, points, suffix, point_format):
+    withheld = np.arange(len(points)) % 7 == 0
+    classes = np.where(np.arange(len(points)) % 5 == 0, 18 if point_format == 6 else 7, 2).astype(np.uint8)
+    path = write_las(
+        tmp_path / f"a.{suffix}", points, classification=classes, withheld=withheld, point_format=point_format
+    )
+    assert np.allclose(read_cloud(path).xyz, points[~withheld & (classes == 2)], atol=0.0006)
+
+
+def test_chunks_come_in_the_files_order_and_the_file_is_closed(tmp_path, points, monkeypatch):
+    monkeypatch.setattr(las, "CHUNK", 700)
+    path = write_las(tmp_path / "a.laz", points)
+    assert np.allclose(read_cloud(path).xyz, points, atol=0.0006)
+    with las.open_cloud(path) as (_, _, chunks):
+        assert len(next(chunks)) == 700
+    assert read_cloud(path, boundary=(CORNER, UTM)).size == shapely.contains_xy(CORNER, points[:, :2]).sum()
+
+
+def test_a_fault_while_points_are_taken_is_the_takers(tmp_path, points, monkeypatch):
+    monkeypatch.setattr(las, "CHUNK", 700)
+
+    class Full:
+        size = 0
+
+        def add(self, xyz):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space left"):
+        read_cloud(write_las(tmp_path / "a.laz", points), collector=Full())
 
 
 def test_missing_file(tmp_path):

@@ -125,6 +125,17 @@ def test_boundary_of_the_named_parcel_or_of_all(tmp_path):
         read_boundary(path, parcel="Baa")
 
 
+@pytest.mark.parametrize("n", [1, 2])
+def test_spikes_of_boundaries_are_no_part_of_them(tmp_path, n):
+    path = tmp_path / "b.gpkg"
+    spiked = shapely.Polygon([(0, 0), (1, 0), (1, 1), (5, 5), (1, 1), (0, 1)])
+    apart = [shapely.transform(spiked, lambda xy, k=k: xy + 10 * k) for k in range(n)]
+    gpd.GeoDataFrame({"name": ["A"] * n}, geometry=apart, crs=32632).to_file(path)
+    found = read_boundary(path, parcel="A")[0]
+    assert found.geom_type == ("Polygon" if n == 1 else "MultiPolygon")
+    assert found.equals(shapely.union_all([shapely.box(10 * k, 10 * k, 10 * k + 1, 10 * k + 1) for k in range(n)]))
+
+
 def test_boundaries_that_are_none(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_boundary(tmp_path / "none.gpkg")
@@ -132,6 +143,10 @@ def test_boundaries_that_are_none(tmp_path):
     text.write_text("no polygons")
     with pytest.raises(InputError, match="can't be read"):
         read_boundary(text)
+    flat = tmp_path / "flat.geojson"
+    gpd.GeoDataFrame(geometry=[shapely.Polygon([(0, 0), (1, 1), (0, 0)])], crs=32632).to_file(flat)
+    with pytest.raises(InputError, match="is empty"):
+        read_boundary(flat)
     lines = tmp_path / "lines.gpkg"
     gpd.GeoDataFrame(geometry=[shapely.LineString([[0, 0], [1, 1]])], crs=32632).to_file(lines)
     with pytest.raises(InputError, match="holds no polygon"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from contextlib import contextmanager
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from vinemap.tiles import Collector
 from vinemap.zones import deal, zones_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -33,6 +32,8 @@ CHUNK = 500_000
 """Points that are decompressed at once."""
 SMALL = 0.25
 """Share of a COPC file's extent up to which a query by box is faster than reading it through."""
+MOST_FOUND = 20_000_000
+"""Points of a COPC file's nodes that are held at once, about 2 GB."""
 LARGEST_RELIEF = 2_000.0
 """Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
@@ -83,7 +84,7 @@ def collected(points: Collector, crs: CRS, vertical: str | None, path: Path) -> 
         If there are no points, or no survey could have them.
     """
     if points.size == 0:
-        raise InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
+        raise _none_inside(path)
     return points.cloud(crs, vertical, *_plausible(points.sample(100_000), path))
 
 
@@ -105,10 +106,15 @@ def open_cloud(
     except Exception as error:  # laspy and lazrs raise many kinds, a Rust panic among them
         raise _unreadable(path, error) from error
     with reader:
+        _check_end(reader.header, path)
         source = crs or _stated_crs(reader.header, path)
         _check_header(reader.header, source, path)
-        chunks = _usable_chunks(reader, source, path, around)
+        box = _small_box(reader.header, source, around) if around else None
+        found = _query(path, box) if box else None
+        chunks = _usable_chunks(reader, path, found)
         first = next(chunks, None)
+        if first is None and found is not None:
+            raise _none_inside(path)
         if first is None:
             raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
         target = metric_crs(source, *np.median(first[:, :2], axis=0))
@@ -137,6 +143,7 @@ def write_classified(
         If it can't be written.
     """
     import laspy
+    from lazrs import LazrsError
 
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales = np.full(3, 0.001)
@@ -149,13 +156,16 @@ def write_classified(
         ]
     )
     backend = laspy.LazBackend.LazrsParallel
-    with laspy.open(path, mode="w", header=header, do_compress=True, laz_backend=backend) as writer:
-        for part in cloud.parts():
-            points = laspy.ScaleAwarePointRecord.zeros(part.size, header=header)
-            points.x, points.y, points.z = part.xyz.T
-            points["classification"], points["row_id"] = classify(part)
-            points["HeightAboveGround"] = part.heights
-            writer.write_points(points)
+    try:
+        with laspy.open(path, mode="w", header=header, do_compress=True, laz_backend=backend) as writer:
+            for part in cloud.parts():
+                points = laspy.ScaleAwarePointRecord.zeros(part.size, header=header)
+                points.x, points.y, points.z = part.xyz.T
+                points["classification"], points["row_id"] = classify(part)
+                points["HeightAboveGround"] = part.heights
+                writer.write_points(points)
+    except LazrsError as error:
+        raise OSError(f"{path.name}: {error}: is the disk full?") from error
 
 
 def _backends(path: Path) -> Any:
@@ -169,6 +179,11 @@ def _needed() -> Any:
     from laspy import DecompressionSelection as Selection
 
     return Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
+
+
+def _check_end(header: Any, path: Path) -> None:
+    if header.number_of_evlrs and header.start_of_first_evlr >= path.stat().st_size:
+        raise InputError(f"{path}: ends before the last records of which its header tells: copy or download it again")
 
 
 def _stated_crs(header: Any, path: Path) -> CRS:
@@ -199,10 +214,8 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
         )
 
 
-def _usable_chunks(reader: Any, source: CRS, path: Path, around: Boundary | None) -> Iterator[Points]:
-    """Coordinates (n, 3) of a file's usable points, in its own CRS, chunk by chunk."""
-    box = _small_box(reader.header, source, around) if around else None
-    found = _query(path, box) if box else None
+def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Points]:
+    """Coordinates (n, 3) of a file's usable points, or of those found, in its own CRS, chunk by chunk."""
     total, done = reader.header.point_count if found is None else len(found), 0
     try:
         for chunk in reader.chunk_iterator(CHUNK) if found is None else [found]:
@@ -219,26 +232,43 @@ def _usable_chunks(reader: Any, source: CRS, path: Path, around: Boundary | None
 
 
 def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
-    """Least and greatest x and y of a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
+    """Corners (3,) about a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
     if not any(record.user_id == "copc" for record in header.vlrs):
         return None
     west, south, east, north = shapely.bounds(project(*around, horizontal(source))).tolist()
     margin = 0.01 * max(east - west, north - south)
     low, high = np.array([west, south]) - margin, np.array([east, north]) + margin
-    whole = np.prod(header.maxs[:2] - header.mins[:2])
-    return (low, high) if np.prod(high - low) < SMALL * whole else None
+    least, most = header.mins, header.maxs
+    if not np.prod(high - low) < SMALL * np.prod((most - least)[:2]):
+        return None
+    # Not far beyond the file's extent, as the query counts in whole numbers; all heights.
+    limits = least - (most - least), most + (most - least)
+    return np.clip([*low, -np.inf], *limits), np.clip([*high, np.inf], *limits)
 
 
 def _query(path: Path, box: Box) -> Any | None:
-    """Points of a COPC file in a box; None where its index can't be read."""
-    from laspy.copc import Bounds, CopcReader
-    from laspy.errors import LaspyException
+    """Points of a COPC file in a box; None where its index can't be read, lacks points, or has too many there."""
+    from laspy.copc import Bounds, CopcReader, load_octree_for_query
 
     try:
         with path.open("rb") as stream:
-            return CopcReader(stream, decompression_selection=_needed()).query(bounds=Bounds(*box))
-    except (LaspyException, LookupError, OSError, RuntimeError, ValueError, struct.error):
+            reader = CopcReader(stream, decompression_selection=_needed())
+            index = stream, reader.copc_info, reader.root_page
+            if _size(load_octree_for_query(*index)) != reader.header.point_count:
+                return None
+            bounds = Bounds(*box)
+            few = _size(load_octree_for_query(*index, query_bounds=bounds)) <= MOST_FOUND
+            return reader.query(bounds=bounds) if few else None
+    except Exception:  # noqa: BLE001 - what reading through then says is clearer
         return None
+
+
+def _size(nodes: Iterable[Any]) -> int:
+    return sum(node.point_count for node in nodes)
+
+
+def _none_inside(path: Path) -> InputError:
+    return InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:

@@ -159,10 +159,17 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
             hint = f"did you mean {close[0]!r}?" if close else "check the name"
             raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
         frame = named
-    polygon = shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy())))
+    polygon = _areas(shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy()))))
     if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
     return shapely.force_2d(polygon), frame.crs
+
+
+def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
+    """The polygons of a geometry, without the lines and points that are left of spikes and double edges."""
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    areas = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+    return geometry if len(areas) == len(parts) else shapely.union_all(areas)
 
 
 def parcel_names(path: Path) -> list[str]:

@@ -9,7 +9,7 @@ import shapely
 from scipy.ndimage import binary_dilation
 
 from vinemap.compiled import compiled
-from vinemap.raster import Grid
+from vinemap.raster import Grid, window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,18 +43,17 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
     # A cell more on each side, so that what lies on an outline never falls off the raster.
     grid = Grid(west - cell, north + cell, cell, int((north - south) / cell) + 3, int((east - west) / cell) + 3)
     code = np.full(grid.shape, NOWHERE, dtype=np.int32)
-    x, y = grid.centres()
     for k, polygon in enumerate(polygons):
-        inside = np.zeros(grid.shape, dtype=bool)
-        west, south, east, north = shapely.bounds(polygon)
-        near = np.ix_(np.flatnonzero((y >= south) & (y <= north)), np.flatnonzero((x >= west) & (x <= east)))
-        inside[near] = shapely.contains_xy(polygon, *(v[near] for v in np.meshgrid(x, y)))
+        corners = np.reshape(shapely.bounds(polygon), (2, 2))
+        part, where = window(grid, corners[0] - 2 * cell, corners[1] + 2 * cell)
+        inside = shapely.contains_xy(polygon, *np.meshgrid(*part.centres()))
         line = shapely.get_coordinates(shapely.segmentize(shapely.boundary(polygon), cell))
-        edge = np.zeros(grid.shape, dtype=bool)
-        edge[((grid.north - line[:, 1]) / cell).astype(int), ((line[:, 0] - grid.west) / cell).astype(int)] = True
+        edge = np.zeros(part.shape, dtype=bool)
+        edge[((part.north - line[:, 1]) / cell).astype(int), ((line[:, 0] - part.west) / cell).astype(int)] = True
         edge = binary_dilation(edge, np.ones((3, 3)))
-        code[inside] = np.where(code[inside] == NOWHERE, k, ASK)
-        code[edge] = ASK
+        here = code[where]
+        here[inside] = np.where(here[inside] == NOWHERE, k, ASK)
+        here[edge] = ASK
     return Zones(polygons, grid, code)
 
 
@@ -82,7 +81,9 @@ def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
         label[inside[~taken]] = k
         again.append(inside[taken])
         into.append(np.full(np.count_nonzero(taken), k, dtype=np.int32))
-    return _gather(xyz, label, np.concatenate(again), np.concatenate(into), len(zones.polygons))
+    shared, others = np.concatenate(again), np.concatenate(into)
+    order = np.argsort(shared, kind="stable")
+    return _gather(xyz, label, shared[order], others[order], len(zones.polygons))
 
 
 @compiled
@@ -95,7 +96,7 @@ def _look_up(xyz: Points, grid: Grid, code: Labels, label: Labels) -> None:
 
 @compiled
 def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) -> tuple[Points, Indices]:
-    """Points by label (n,), and those ``again`` that a further polygon holds, behind its others."""
+    """Points by label (n,), and those ``again``, in climbing order, that a further polygon holds too."""
     start = np.zeros(k + 1, dtype=np.int64)
     for zone in label:
         if zone >= 0:
@@ -104,11 +105,13 @@ def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) ->
         start[zone + 1] += 1
     start = np.cumsum(start)
     out, place = np.empty((start[-1], 3)), start[:-1].copy()
+    q = 0
     for p in range(len(label)):
         if label[p] >= 0:
             _copy(xyz, p, out, place, label[p])
-    for q in range(len(into)):
-        _copy(xyz, again[q], out, place, into[q])
+        while q < len(again) and again[q] == p:
+            _copy(xyz, p, out, place, into[q])
+            q += 1
     return out, start
 
 
