@@ -28,7 +28,7 @@ from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
 from vinemap.errors import InputError
-from vinemap.ground import canopy_height_model, terrain_model, tile_side
+from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
@@ -211,7 +211,7 @@ def map_parcel(
         collector = Collector(
             paths.tiles(draft),
             most=settings.reading.max_points or int(share * _most_points()),
-            side=tile_side(settings.ground.resolution),
+            block=block_side(settings.ground.resolution),
         )
         points: Cloud
         if with_pdal:
