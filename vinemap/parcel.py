@@ -154,6 +154,7 @@ def map_parcel(
     origin: Origin | None = None,
     piece: Piece | None = None,
     inputs: Sequence[dict[str, Any]] = (),
+    drafts: Path | None = None,
     share: float = 1.0,
     step: Callable[..., Any] = call,
 ) -> Summary:
@@ -181,6 +182,8 @@ def map_parcel(
         The parcel's points, where the cloud was read before.
     inputs : sequence of dict, optional
         Fingerprints of cloud and boundary, where they are known.
+    drafts : Path, optional
+        Folder on the product's disk where it is made, if not beside it.
     share : float
         Share of the memory that is this run's, where others run beside it.
     step : callable
@@ -206,7 +209,7 @@ def map_parcel(
 
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = list(inputs) or [fingerprint(path) for path in (cloud, boundary) if path]
-    with paths.product(folder) as draft:
+    with paths.product(folder, drafts) as draft:
         paths.tiles(draft).mkdir()
         collector = Collector(
             paths.tiles(draft),
