@@ -11,7 +11,7 @@ import shapely
 
 from vinemap.errors import InputError
 from vinemap.style import alias
-from vinemap.vector import LAYERS, conform, read_boundary, write_geopackage
+from vinemap.vector import LAYERS, conform, parcel_names, read_boundary, write_geopackage
 
 CONTRACT = {
     "rows": (
@@ -123,6 +123,60 @@ def test_boundary_of_the_named_parcel_or_of_all(tmp_path):
     assert read_boundary(path)[0].area == pytest.approx(2.7)
     with pytest.raises(InputError, match="did you mean 'Ba'"):
         read_boundary(path, parcel="Baa")
+
+
+def polygons(path, **columns):
+    """Write squares side by side, a column of names for each."""
+    n = len(next(iter(columns.values())))
+    squares = [shapely.box(k, 0, k + 0.9, 1) for k in range(n)]
+    gpd.GeoDataFrame(columns, geometry=squares, crs=32632).to_file(path)
+    return path, squares
+
+
+@pytest.mark.parametrize(
+    ("columns", "names"),
+    [
+        ({"name": ["A", "B", "C"]}, ["A", "B", "C"]),
+        ({"Vigna": ["A", "B", "C"]}, ["A", "B", "C"]),
+        ({"no": [3, 1, 2], "Name": ["A", "B", "C"]}, ["A", "B", "C"]),
+        ({"area": [0.5, 1.5, 2.5], "LABEL": ["b", "c", "a"], "vine": ["x", "y", "z"]}, ["b", "c", "a"]),
+        ({"name": ["A", "B", "A"], "id": [7, 8, 9]}, ["7", "8", "9"]),
+        ({"name": ["A", None, "C"], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
+        ({"name": ["A", " ", "C"], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
+    ],
+)
+def test_names_of_parcels(tmp_path, columns, names):
+    path, squares = polygons(tmp_path / "b.gpkg", **columns)
+    assert parcel_names(path) == names
+    for name, square in zip(names, squares, strict=True):
+        assert read_boundary(path, parcel=name)[0].equals(square)
+
+
+def test_no_column_names_each_parcel(tmp_path):
+    path, _ = polygons(tmp_path / "b.gpkg", name=["A", "A", "C"], plot=["P", None, "Q"])
+    with pytest.raises(InputError, match=r"b\.gpkg: no column has a name of its own for each of its 3 polygons"):
+        parcel_names(path)
+    bare = tmp_path / "bare.geojson"
+    gpd.GeoDataFrame(geometry=[shapely.box(0, 0, 1, 1)], crs=32632).to_file(bare)
+    with pytest.raises(InputError, match="no column has a name"):
+        parcel_names(bare)
+
+
+def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):
+    """Numbers of plots, say, that are those of other parcels in another column."""
+    path, squares = polygons(tmp_path / "b.gpkg", block=["B", "A", "A"], name=["A", "B", "C"], code=[2, 1, 3])
+    assert parcel_names(path) == ["A", "B", "C"]
+    for name, square in zip("ABC", squares, strict=True):
+        assert read_boundary(path, parcel=name)[0].equals(square)
+    assert read_boundary(path, parcel="1")[0].equals(squares[1])
+    path, squares = polygons(tmp_path / "c.gpkg", name=["A", None, "1"], id=[1, 2, 3])
+    for name, square in zip(parcel_names(path), squares, strict=True):
+        assert read_boundary(path, parcel=name)[0].equals(square)
+
+
+def test_polygons_of_one_name_are_one_parcel(tmp_path):
+    path, squares = polygons(tmp_path / "b.gpkg", name=["A", "B", "A"], id=[1, 2, 3])
+    assert read_boundary(path, parcel="A")[0].equals(shapely.union_all([squares[0], squares[2]]))
 
 
 @pytest.mark.parametrize("n", [1, 2])

@@ -109,10 +109,9 @@ def _blocks(resolution: float) -> int:
     return max(1, round(COARSE / resolution))
 
 
-def tile_side(resolution: float) -> float:
-    """Side in metres, about 64, of tiles of a cloud whose edges are those of the terrain model's blocks of cells."""
-    block = _blocks(resolution) * resolution
-    return max(1, round(64 / block)) * block
+def block_side(resolution: float) -> float:
+    """Side in metres of the terrain model's blocks of cells, which a cloud in tiles must not divide."""
+    return _blocks(resolution) * resolution
 
 
 def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:

@@ -28,7 +28,7 @@ from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
 from vinemap.errors import InputError
-from vinemap.ground import canopy_height_model, terrain_model, tile_side
+from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
@@ -154,6 +154,7 @@ def map_parcel(
     origin: Origin | None = None,
     piece: Piece | None = None,
     inputs: Sequence[dict[str, Any]] = (),
+    drafts: Path | None = None,
     share: float = 1.0,
     step: Callable[..., Any] = call,
 ) -> Summary:
@@ -181,6 +182,8 @@ def map_parcel(
         The parcel's points, where the cloud was read before.
     inputs : sequence of dict, optional
         Fingerprints of cloud and boundary, where they are known.
+    drafts : Path, optional
+        Folder on the product's disk where it is made, if not beside it.
     share : float
         Share of the memory that is this run's, where others run beside it.
     step : callable
@@ -206,12 +209,12 @@ def map_parcel(
 
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = list(inputs) or [fingerprint(path) for path in (cloud, boundary) if path]
-    with paths.product(folder) as draft:
+    with paths.product(folder, drafts) as draft:
         paths.tiles(draft).mkdir()
         collector = Collector(
             paths.tiles(draft),
             most=settings.reading.max_points or int(share * _most_points()),
-            side=tile_side(settings.ground.resolution),
+            block=block_side(settings.ground.resolution),
         )
         points: Cloud
         if with_pdal:

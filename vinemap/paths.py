@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import tempfile
 import uuid
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 from vinemap.errors import OutputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 DATA = Path("data")
 PIECES = ".pieces-"
@@ -77,11 +78,36 @@ def run_record(folder: Path) -> Path:
 
 
 @contextmanager
-def product(target: Path) -> Iterator[Path]:
-    """Give a folder beside ``target`` to write a product into, and put it in place if all went well.
+def aside(folder: Path) -> Iterator[Path]:
+    """Give a folder in another, for what goes again; so does the other if it has been made for it and stays empty.
 
-    A folder that is missing, empty or holds an earlier product is replaced whole. In one that holds other files, the
-    product's replace those of the same name and the others stay.
+    Raises
+    ------
+    OSError
+        If they can't be made.
+    """
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=PIECES, dir=folder) as inner:
+            yield Path(inner).resolve()
+    finally:
+        _remove_empty(made)
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+@contextmanager
+def product(target: Path, drafts: Path | None = None) -> Iterator[Path]:
+    """Give a folder to write a product into, and put it in place of ``target`` if all went well.
+
+    A target that is missing, empty or holds an earlier product is replaced whole. In one that holds other files, the
+    product's replace those of the same name and the others stay. The folder is made beside the target, or among
+    ``drafts``, on the same disk, where somebody clears up even if this process dies.
 
     Raises
     ------
@@ -89,7 +115,7 @@ def product(target: Path) -> Iterator[Path]:
         If nothing can be written there.
     """
     target = target.resolve()
-    draft = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
+    draft = (drafts or target.parent) / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
     made = [folder for folder in target.parents if not folder.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -106,9 +132,7 @@ def product(target: Path) -> Iterator[Path]:
         raise _unwritable(target, error) from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
+        _remove_empty(made)
 
 
 def _unwritable(target: Path, error: OSError) -> OutputError:
@@ -119,7 +143,7 @@ def _publish(draft: Path, target: Path) -> None:
     if not target.exists():
         draft.rename(target)
     elif _replaceable(target, draft):
-        old = draft.with_suffix(".old")
+        old = target.with_name(draft.with_suffix(".old").name)
         target.rename(old)
         try:
             draft.rename(target)

@@ -61,7 +61,7 @@ def split_cloud(cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, cr
             xyz, start = deal(chunk, zones)
             for k in np.flatnonzero(np.diff(start)):
                 with pieces[k].path.open("ab") as stream:
-                    xyz[start[k] : start[k + 1]].tofile(stream)
+                    stream.write(xyz[start[k] : start[k + 1]].data)
     return pieces
 
 

@@ -74,9 +74,11 @@ def grid_over(low: ArrayLike, high: ArrayLike, *, resolution: float, multiple: i
     """
     (west, south), (east, north) = (np.asarray(corner, dtype=float)[:2] for corner in (low, high))
     step = multiple * resolution
-    left, bottom = np.floor(west / step) * step, np.floor(south / step) * step
-    nx = (int((east - left) // step) + 1) * multiple
-    ny = (int(np.ceil((north - bottom) / step)) + 1) * multiple
+    columns, rows = squares([(west, south), (east, north)], step)
+    left, bottom = columns[0] * step, rows[0] * step
+    nx = int(columns[1] - columns[0] + 1) * multiple
+    reach = int(np.ceil((north - np.floor(south / step) * step) / step)) + 1
+    ny = max(reach, int(rows[1] - rows[0]) + 1) * multiple
     if nx * ny > MAX_CELLS:
         raise InputError(
             f"the cloud spans {east - west:.0f} m by {north - south:.0f} m, too much for one parcel at "
@@ -85,14 +87,27 @@ def grid_over(low: ArrayLike, high: ArrayLike, *, resolution: float, multiple: i
     return Grid(float(left), float(bottom + ny * resolution), resolution, ny, nx)
 
 
+def squares(xy: ArrayLike, side: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns and rows (…,), counted to the east and north, of the squares at multiples of a side that hold points.
+
+    Points (…, ≥2) on an edge are the eastern or southern square's, as in the cells of a grid.
+    """
+    points = np.asarray(xy, dtype=float)
+    return np.floor(points[..., 0] / side).astype(np.int64), np.ceil(points[..., 1] / side).astype(np.int64) - 1
+
+
 def window(grid: Grid, low: ArrayLike, high: ArrayLike, *, multiple: int = 1) -> tuple[Grid, tuple[slice, slice]]:
-    """Part of a grid that covers an extent (≥2,), (≥2,), in whole blocks of several cells, and where it lies in it."""
-    (west, south), (east, north) = (np.asarray(corner, dtype=float)[:2] for corner in (low, high))
+    """Part of a grid that covers an extent (≥2,), (≥2,), in whole blocks of several cells, and where it lies in it.
+
+    The grid's edges are at multiples of the blocks, as those of :func:`grid_over`. Which block holds a point is told
+    as by :func:`squares`, to the last bit, so that parts of a cloud that share no square share no block.
+    """
     step = multiple * grid.resolution
-    i = [int((grid.north - y) // step) * multiple for y in (north, south)]
-    j = [int((x - grid.west) // step) * multiple for x in (west, east)]
+    columns_held, rows_held = squares([np.asarray(corner, dtype=float)[:2] for corner in (low, high)], step)
+    i = (round(grid.north / step) - 1 - rows_held[::-1]) * multiple
+    j = (columns_held - round(grid.west / step)) * multiple
     rows, columns = (
-        slice(min(max(first, 0), n), min(max(last, 0) + multiple, n))
+        slice(min(max(int(first), 0), n), min(max(int(last), 0) + multiple, n))
         for (first, last), n in zip((i, j), grid.shape, strict=True)
     )
     part = Grid(

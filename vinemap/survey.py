@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-import tempfile
 from concurrent.futures import TimeoutError as OutOfTime
 from concurrent.futures import as_completed
+from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from pebble import ProcessExpired, ProcessPool
@@ -23,6 +22,7 @@ from vinemap.vector import read_boundary
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from concurrent.futures import Future
+    from pathlib import Path
 
     from pyproj import CRS
 
@@ -40,7 +40,7 @@ class Outcome(NamedTuple):
 
     def line(self) -> str:
         """The same as a sentence."""
-        return self.summary.line() if self.summary else f"{self.parcel}: failed: {self.reason}"
+        return self.summary.line() if self.summary else f"{self.parcel}: failed: {' '.join(self.reason.split())}"
 
 
 def map_survey(
@@ -102,26 +102,35 @@ def map_survey(
         _work, cloud, boundary=boundaries, settings=settings, crs=crs, origin=origin, inputs=inputs, share=1 / n
     )
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with (
-            tempfile.TemporaryDirectory(prefix=paths.PIECES, dir=folder) as aside,
-            ProcessPool(
-                n,
-                context=multiprocessing.get_context("spawn"),
-                initializer=_begin,
-                initargs=(max(1, compiled.CORES // n),),
-            ) as pool,
-        ):
+        # What a process leaves that is killed lies aside as well.
+        with paths.aside(folder) as aside, _processes(n) as pool:
             pool.submit(int, None)  # nothing: processes start while the cloud is read
-            pieces = _pieces(cloud, polygons, Path(aside), crs=crs, settings=settings)
+            pieces = _pieces(cloud, polygons, aside, crs=crs, settings=settings)
             largest_first = sorted(zip(polygons, pieces, strict=True), key=lambda job: -_size(job[1]))
             jobs: dict[Future[Summary], str] = {
-                pool.submit(work, limit, folder / parcel, parcel, piece): parcel for parcel, piece in largest_first
+                pool.submit(work, limit, folder / parcel, parcel, piece, aside): parcel
+                for parcel, piece in largest_first
             }
             for job in as_completed(jobs):
                 yield _outcome(jobs[job], job, limit)
     except OSError as error:
         raise OutputError(f"{folder}: can't be written ({error.strerror or error}): choose another folder") from error
+
+
+@contextmanager
+def _processes(n: int) -> Iterator[ProcessPool]:
+    """Processes that are stopped at once if their work is broken off."""
+    with ProcessPool(
+        n,
+        context=multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=(max(1, compiled.CORES // n),),
+    ) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.stop()  # type: ignore[no-untyped-call]
+            raise
 
 
 def _pieces(
@@ -142,9 +151,9 @@ def _begin(cores: int) -> None:
     compiled.use_cores(cores)
 
 
-def _work(cloud: Path, folder: Path, parcel: str, piece: Piece | None, **options: object) -> Summary:
+def _work(cloud: Path, folder: Path, parcel: str, piece: Piece | None, drafts: Path, **options: object) -> Summary:
     try:
-        return map_parcel(cloud, folder, parcel=parcel, piece=piece, **options)  # type: ignore[arg-type]
+        return map_parcel(cloud, folder, parcel=parcel, piece=piece, drafts=drafts, **options)  # type: ignore[arg-type]
     finally:
         if piece:
             piece.path.unlink(missing_ok=True)

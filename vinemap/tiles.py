@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap.bins import bin_points
 from vinemap.cloud import PointCloud, row_groups
-from vinemap.raster import extent, grid_over
+from vinemap.raster import extent, squares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -25,6 +24,10 @@ if TYPE_CHECKING:
 
 CHUNK = 1_000_000
 """Points that are moved to tiles at once."""
+SIDE = 64.0
+"""Metres, about, of a tile's side."""
+FARTHEST = 1e9
+"""Metres from zero beyond which all points go to the same tiles."""
 
 
 class Tile(NamedTuple):
@@ -86,9 +89,9 @@ Cloud = PointCloud | TiledCloud
 class Collector:
     """Takes points chunk by chunk: in memory up to a number of them, in tiles in a folder beyond it."""
 
-    def __init__(self, folder: Path | None = None, *, most: float = np.inf, side: float = 64.0) -> None:
-        """Without a folder all stay in memory; ``side`` is that of a tile in metres."""
-        self.folder, self.most, self.side = folder, most, side
+    def __init__(self, folder: Path | None = None, *, most: float = np.inf, block: float = 1.0) -> None:
+        """Without a folder all stay in memory; ``block`` is the side in metres of squares that no tile divides."""
+        self.folder, self.most, self.block = folder, most, block
         self.xyz = np.empty((0, 3))
         self.tiles: dict[Path, Tile] = {}
         self.size = 0
@@ -130,20 +133,27 @@ class Collector:
         step = max(1, self.size // n)
         if not self.tiles:
             return self.xyz[::step]
-        return np.concatenate([np.fromfile(path).reshape(-1, 3)[::step] for path in self.tiles])
+        parts, passed = [], 0
+        for path, tile in self.tiles.items():
+            parts.append(np.fromfile(path).reshape(-1, 3)[-passed % step :: step])
+            passed += tile.size
+        return np.concatenate(parts)
 
     def _to_tiles(self, xyz: Points) -> None:
         if len(xyz) == 0:
             return
         assert self.folder is not None  # noqa: S101
-        grid = grid_over(*extent(xyz), resolution=self.side)
-        bins = bin_points(xyz, grid)
-        column, row = round(grid.west / self.side), round(grid.north / self.side)
-        for cell in np.flatnonzero(np.diff(bins.start)):
-            points = xyz[bins.member[bins.start[cell] : bins.start[cell + 1]]]
-            path = self.folder / f"{column + cell % grid.nx}_{row - cell // grid.nx}.xyz"
+        blocks = max(1, round(SIDE / self.block))
+        column, row = (held // blocks for held in squares(np.clip(xyz[:, :2], -FARTHEST, FARTHEST), self.block))
+        tile = (column - column.min()) * (np.ptp(row) + 1) + row - row.min()
+        if tile.max() > np.iinfo(np.uint16).max:  # strays
+            tile = np.unique(tile, return_inverse=True)[1]
+        order = np.argsort(tile.astype(np.min_scalar_type(tile.max())), kind="stable")
+        for member in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
+            points = xyz[member]
+            path = self.folder / f"{column[member[0]]}_{row[member[0]]}.xyz"
             with path.open("ab") as stream:
-                points.tofile(stream)
+                stream.write(points.data)
             low, high = extent(points)
             old = self.tiles.get(path, Tile(path, low, high, 0))
             self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    import pandas as pd
     from pyproj import CRS
 
 PARCEL_LAYER = "parcel"
@@ -142,7 +143,8 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     path : Path
         File whose only layer of polygons, or whose layer ``parcel``, is read.
     parcel : str, optional
-        Name that one of the polygon's columns holds, where there are several; without a name all of them count.
+        Name that one of the polygon's columns holds, where there are several; without a name all of them count. The
+        column is that of :func:`parcel_names`, or the next one that holds the name.
 
     Raises
     ------
@@ -152,13 +154,13 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     frame = _read_polygons(path)
     if parcel is not None and len(frame) > 1:
         columns = frame.drop(columns="geometry").astype(str)
-        named = frame[(columns == parcel).any(axis=1)]
-        if len(named) == 0:
+        holding = [name for name in _name_columns(frame) if (columns[name] == parcel).any()]
+        if not holding:
             words = sorted({word for name in columns for word in columns[name] if word not in ("None", "nan")})
             close = difflib.get_close_matches(parcel, words, n=1, cutoff=0.5)
             hint = f"did you mean {close[0]!r}?" if close else "check the name"
             raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
-        frame = named
+        frame = frame[columns[holding[0]] == parcel]
     polygon = _areas(shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy()))))
     if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
@@ -181,12 +183,21 @@ def parcel_names(path: Path) -> list[str]:
         If the file can't be read, has no polygon or no CRS, or no column that has a name for each.
     """
     frame = _read_polygons(path)
-    columns = [name for name in frame.columns if name != "geometry"]
-    for name in sorted(columns, key=lambda name: str(name).lower() not in NAME_COLUMNS):
-        names = frame[name]
-        if not names.isna().any() and names.astype(str).is_unique and (names.astype(str).str.strip() != "").all():
-            return list(names.astype(str))
+    for name in _name_columns(frame)[:1]:
+        if _tells_apart(frame[name]):
+            return list(frame[name].astype(str))
     raise InputError(f"{path}: no column has a name of its own for each of its {len(frame)} polygons: add one, 'name'")
+
+
+def _name_columns(frame: gpd.GeoDataFrame) -> list[str]:
+    """Columns that may name polygons: such as have a name for each first, and of these, likely ones."""
+    columns = [str(name) for name in frame.columns if name != "geometry"]
+    return sorted(columns, key=lambda name: (not _tells_apart(frame[name]), name.lower() not in NAME_COLUMNS))
+
+
+def _tells_apart(names: pd.Series) -> bool:
+    words = names.astype(str)
+    return bool(words.is_unique and not names.isna().any() and (words.str.strip() != "").all())
 
 
 def _read_polygons(path: Path) -> gpd.GeoDataFrame:

@@ -40,8 +40,10 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
     shapely.prepare(np.array(polygons))
     west, south, east, north = shapely.total_bounds(np.array(polygons))
     cell = max(CELL, float(np.sqrt((east - west) * (north - south) / MOST_CELLS)))
-    # A cell more on each side, so that what lies on an outline never falls off the raster.
-    grid = Grid(west - cell, north + cell, cell, int((north - south) / cell) + 3, int((east - west) / cell) + 3)
+    # Two cells more on each side, so that what lies on an outline never falls off the raster.
+    first, last = np.floor(west / cell) - 2, np.ceil(north / cell) + 2
+    ny, nx = int(last - south / cell) + 3, int(east / cell - first) + 3
+    grid = Grid(float(first * cell), float(last * cell), cell, ny, nx)
     code = np.full(grid.shape, NOWHERE, dtype=np.int32)
     for k, polygon in enumerate(polygons):
         corners = np.reshape(shapely.bounds(polygon), (2, 2))

@@ -1,0 +1,283 @@
+"""Many parcels in one job: what each would be alone, and what one's fault costs the others."""
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as OutOfTime
+
+import geopandas as gpd
+import numpy as np
+import pytest
+import shapely
+from pebble import ProcessExpired
+
+from vinemap import paths
+from vinemap.errors import InputError, OutputError
+from vinemap.las import read_cloud
+from vinemap.parcel import Summary, map_parcel
+from vinemap.pieces import read_piece, split_cloud
+from vinemap.scenes import hillside, rows_of
+from vinemap.survey import Outcome, _outcome, map_survey
+from vinemap.synthetic import Vineyard, simulate, write_survey
+from vinemap.tiles import Collector
+from vinemap.vector import read_boundary
+
+VINEMAP = [sys.executable, "-m", "vinemap.cli"]
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    """Three small parcels; in ``more.gpkg`` beside them one that shares its points with A, and one without any."""
+    place = np.mean(rows_of(1)[0], axis=0)
+    plots = [
+        Vineyard("A", rows_of(4, length=20, azimuth=33)),
+        Vineyard("B", rows_of(4, length=15, centre=tuple(place + [40, 0]))),
+        Vineyard("C", rows_of(5, length=18, azimuth=90, centre=tuple(place + [0, 40]))),
+    ]
+    survey = simulate(plots, hillside(0.1), name="three", density=200, seed=1)
+    path = write_survey(survey, tmp_path_factory.mktemp("survey"))
+    polygons = survey.parcels[["name", "geometry"]]
+    shapes = [*polygons.geometry, polygons.geometry[0].buffer(-2), shapely.box(0, 0, 9, 9)]
+    names = [*polygons["name"], "inner A", "empty"]
+    gpd.GeoDataFrame({"name": names}, geometry=shapes, crs=polygons.crs).to_file(path.with_name("more.gpkg"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def boundaries(cloud):
+    return cloud.with_name("more.gpkg")
+
+
+@pytest.fixture(scope="module")
+def mapped(cloud, boundaries, tmp_path_factory):
+    """Outcomes of a job with a parcel that isn't there and one without points, and the folder of its products."""
+    folder = tmp_path_factory.mktemp("job") / "products"
+    parcels = ["nobody's", "A", "B", "C", "inner A", "empty"]
+    outcomes = list(map_survey(cloud, folder, parcels=parcels, boundaries=boundaries))
+    return {outcome.parcel: outcome for outcome in outcomes}, folder
+
+
+def contents(path):
+    """Bytes of a file; of a GeoPackage all tables, but for the times at which they were written."""
+    if path.suffix != ".gpkg":
+        return path.read_bytes()
+    db = sqlite3.connect(path)
+    db.row_factory = sqlite3.Row
+    try:
+        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")]
+        found = {name: [dict(row) for row in db.execute(f'SELECT * FROM "{name}"')] for name in tables}
+    finally:
+        db.close()
+    times = {"last_change", "update_time"}
+    return {name: [{key: row[key] for key in row.keys() - times} for row in rows] for name, rows in found.items()}
+
+
+@pytest.mark.parametrize("parcel", ["A", "B", "C", "inner A"])
+def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, tmp_path, parcel):
+    outcomes, folder = mapped
+    alone = tmp_path / parcel
+    summary = map_parcel(cloud, alone, parcel=parcel, boundary=boundaries)
+    found = outcomes[parcel].summary
+    assert (found.rows, found.length, found.folder) == (summary.rows, summary.length, folder / parcel)
+    assert found.rows > 0
+    names = sorted(path.name for path in alone.iterdir())
+    assert sorted(path.name for path in (folder / parcel).iterdir()) == names
+    for name in names:
+        if name != paths.RUN:
+            assert contents(folder / parcel / name) == contents(alone / name), name
+    records = [json.loads(paths.run_record(place).read_text()) for place in (folder / parcel, alone)]
+    for record in records:
+        assert record.pop("created")
+        assert record.pop("seconds")["All"] > 0
+    assert records[0] == records[1]
+
+
+def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
+    outcomes, folder = mapped
+    assert set(outcomes) == {"nobody's", "A", "B", "C", "inner A", "empty"}
+    assert outcomes["nobody's"].summary is None
+    assert f'{boundaries}: none of its 5 polygons has "nobody\'s" in a column' in outcomes["nobody's"].line()
+    assert outcomes["empty"].line().startswith("empty: failed: ")
+    assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "inner A"]
+    assert [path.name for path in folder.parent.iterdir()] == ["products"]
+
+
+def test_too_short_a_limit_leaves_nothing(cloud, boundaries, tmp_path):
+    folder = tmp_path / "new" / "products"
+    outcomes = list(map_survey(cloud, folder, parcels=["A", "B", "C"], boundaries=boundaries, limit=0.01))
+    assert sorted(outcome.line() for outcome in outcomes) == [
+        f"{parcel}: failed: took longer than 0.01 s" for parcel in "ABC"
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_earlier_products_outlive_a_failure(cloud, boundaries, tmp_path):
+    (tmp_path / "A").mkdir()
+    (tmp_path / "A" / "kept.txt").write_text("kept")
+    (outcome,) = map_survey(cloud, tmp_path, parcels=["A"], boundaries=boundaries, limit=0.01)
+    assert outcome.summary is None
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["A", "A/kept.txt"]
+
+
+def test_no_parcel_at_all_needs_no_cloud(boundaries, tmp_path):
+    outcomes = list(map_survey(tmp_path / "none.laz", tmp_path / "out", parcels=["X", "Y"], boundaries=boundaries))
+    assert [outcome.parcel for outcome in outcomes] == ["X", "Y"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cloud_that_cannot_be_read_is_the_whole_jobs_fault(cloud, boundaries, tmp_path):
+    cut = tmp_path / "cut.laz"
+    cut.write_bytes(cloud.read_bytes()[:200_000])
+    for path, reason in ((cut, r"cut\.laz: "), (tmp_path / "none.laz", "no such file")):
+        with pytest.raises(InputError, match=reason):
+            list(map_survey(path, tmp_path / "new" / "out", parcels=["A", "B"], boundaries=boundaries))
+        assert [path.name for path in tmp_path.iterdir()] == ["cut.laz"]
+
+
+def test_a_folder_that_cannot_be_written(cloud, boundaries, tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match=r"file/out: can't be written \(Not a directory\): choose another folder"):
+        list(map_survey(cloud, tmp_path / "file" / "out", parcels=["A", "B"], boundaries=boundaries))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_whoever_asks_for_no_more_outcomes_stops_the_job(cloud, boundaries, tmp_path):
+    folder = tmp_path / "out"
+    outcomes = map_survey(cloud, folder, parcels=["A", "B", "C", "inner A"], boundaries=boundaries, workers=1)
+    first = next(outcomes)
+    assert first.summary
+    outcomes.close()
+    done = sorted(path.name for path in folder.iterdir())
+    assert first.parcel in done
+    assert len(done) < 4
+    assert all((folder / name / "run.json").is_file() for name in done)
+
+
+def ended(error=None, value=None):
+    job = Future()
+    job.set_exception(error) if error else job.set_result(value)
+    return job
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (InputError("a.laz: no such file"), "a.laz: no such file"),
+        (OutOfTime("Task timeout", 5.0), "took longer than 5 s"),
+        (ProcessExpired("Abnormal termination", code=-9, pid=17), "its process died (code -9)"),
+        (MemoryError(), "not enough memory"),
+        (ZeroDivisionError("oops"), "a fault of vinemap's own (ZeroDivisionError: oops)"),
+        (RuntimeError("two\nlines"), "a fault of vinemap's own (RuntimeError: two lines)"),
+    ],
+)
+def test_what_became_of_a_parcel(error, reason):
+    outcome = _outcome("F", ended(error), 5.0)
+    assert outcome.summary is None
+    assert outcome.line() == f"F: failed: {reason}"
+
+
+def test_what_was_found_in_a_parcel(tmp_path):
+    summary = Summary("F", tmp_path, 16, 2345.6, 1.25)
+    assert _outcome("F", ended(value=summary), None) == Outcome("F", summary)
+    assert Outcome("F", summary).line() == f"F: 16 rows, 2,346 m, in 1.2 s → {tmp_path}"
+
+
+@pytest.mark.parametrize("most", [np.inf, 1000])
+def test_pieces_are_what_reading_alone_gives(cloud, boundaries, tmp_path, most):
+    names = ["A", "inner A", "B"]
+    polygons = [read_boundary(boundaries, parcel=name) for name in names]
+    for name, boundary, piece in zip(names, polygons, split_cloud(cloud, polygons, tmp_path), strict=True):
+        (tmp_path / name).mkdir()
+        found = read_piece(piece, Collector(tmp_path / name, most=most))
+        alone = read_cloud(cloud, boundary=boundary)
+        parts = np.concatenate([part.xyz for part in found.parts()])
+        order = slice(None) if most == np.inf else np.lexsort(parts.T)
+        assert np.array_equal(parts[order], alone.xyz if most == np.inf else alone.xyz[np.lexsort(alone.xyz.T)])
+        assert (found.crs, found.vertical) == (alone.crs, alone.vertical)
+
+
+def vinemap(*args, cwd):
+    return subprocess.run(
+        [*VINEMAP, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_the_command(cloud, boundaries, tmp_path):
+    done = vinemap("survey", cloud, "--boundaries", cloud.with_name("parcels.gpkg"), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    folder = tmp_path / "data" / "products" / "three"
+    lines = sorted(done.stdout.splitlines())
+    assert [line.split(": ")[0] for line in lines] == ["A", "B", "C"]
+    assert lines[0].startswith("A: 4 rows, ")
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C"]
+    words = "--boundaries", boundaries, "--parcel", "B", "--parcel", "empty", "--out", "out"
+    done = vinemap("survey", cloud, *words, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stdout.startswith("B: 4 rows, ")
+    assert done.stdout.count("\n") == done.stderr.count("\n") == 1
+    assert done.stderr.startswith("empty: failed: ")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["B"]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["none.laz", "--boundaries", "{b}"], "none.laz: no such file"),
+        (["{c}", "--boundaries", "none.gpkg"], "none.gpkg: no such file"),
+        (["{c}", "--boundaries", "{b}", "--parcel", "../A"], "can't name a file"),
+        (["{c}", "--boundaries", "{b}", "--limit", "0"], "--limit"),
+        (["{c}", "--boundaries", "{b}", "--crs", "EPSG:99"], "EPSG:99"),
+        (["{c}"], "--boundaries"),
+    ],
+)
+def test_what_a_user_can_mend(cloud, boundaries, tmp_path, words, reason):
+    done = vinemap("survey", *(word.format(b=boundaries, c=cloud) for word in words), cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("vinemap: ")
+    assert done.stderr.count("\n") == 1
+    assert reason in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def children(group):
+    """Processes of a group that still run."""
+    listed = subprocess.run(["ps", "-eo", "pgid=,stat="], capture_output=True, text=True, check=True).stdout
+    return [line for line in listed.splitlines() if line.split()[0] == str(group) and "Z" not in line]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no such signals here")
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
+    """Stopped as by Ctrl-C, to all its processes, or by a scheduler, to the first alone, while parcels are worked."""
+    parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
+    many = gpd.GeoDataFrame(
+        {"name": [f"{name}{k}" for k in range(20) for name in parcels["name"]]},
+        geometry=[*parcels.geometry] * 20,
+        crs=parcels.crs,
+    )
+    many.to_file(tmp_path / "many.gpkg")
+    words = [*VINEMAP, "survey", cloud, "--boundaries", "many.gpkg", "--out", "out"]
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as job:
+        first = job.stdout.readline()
+        (os.killpg if number == "SIGINT" else os.kill)(job.pid, getattr(signal, number))
+        rest, errors = job.communicate(timeout=60)
+    assert job.returncode == code
+    assert errors.strip() == ("vinemap: stopped" if number == "SIGINT" else "")
+    deadline = time.monotonic() + 10
+    while children(job.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert children(job.pid) == []
+    done = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {line.split(":")[0] for line in (first + rest).splitlines()} <= done
+    assert len(done) < 30
+    assert all((tmp_path / "out" / name / "run.json").is_file() for name in done)
