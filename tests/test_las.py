@@ -282,6 +282,19 @@ def test_truncated_file(tmp_path, points, suffix, part):
         read_cloud(path)
 
 
+def test_a_panic_of_the_decompressor_is_one_line(tmp_path, points, monkeypatch):
+    class PanicException(BaseException):
+        pass
+
+    def panic(reader, size):
+        raise PanicException("capacity overflow")
+
+    path = write_las(tmp_path / "a.laz", points)
+    monkeypatch.setattr(laspy.LasReader, "chunk_iterator", panic)
+    with pytest.raises(InputError, match=r"a\.laz: can't be read as LAS or LAZ \(capacity overflow\)"):
+        read_cloud(path)
+
+
 def test_empty_cloud(tmp_path):
     with pytest.raises(InputError, match="holds no points"):
         read_cloud(write_las(tmp_path / "a.las", np.empty((0, 3))))

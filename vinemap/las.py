@@ -39,6 +39,9 @@ LARGEST_RELIEF = 2_000.0
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
 
+OURS = (InputError, KeyboardInterrupt, SystemExit, GeneratorExit)
+"""What isn't raised by laspy and lazrs, which raise many kinds: a Rust panic isn't even an Exception."""
+
 Boundary = tuple[shapely.Geometry, "CRS"]
 """A polygon and its CRS."""
 
@@ -103,7 +106,9 @@ def open_cloud(
         raise InputError(f"{path}: no such file")
     try:
         reader = laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed())
-    except Exception as error:  # laspy and lazrs raise many kinds, a Rust panic among them
+    except OURS:
+        raise
+    except BaseException as error:
         raise _unreadable(path, error) from error
     with reader:
         _check_end(reader.header, path)
@@ -223,9 +228,9 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Point
             xyz = _usable(chunk)
             if len(xyz):
                 yield xyz
-    except InputError:
+    except OURS:
         raise
-    except Exception as error:
+    except BaseException as error:
         raise _unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
@@ -271,7 +276,7 @@ def _none_inside(path: Path) -> InputError:
     return InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
+def _unreadable(path: Path, error: BaseException) -> InputError:
     reason = str(error).strip().split("\n")[0] or type(error).__name__
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
