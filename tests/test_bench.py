@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from vinemap import bench, bench_jobs
+from vinemap import bench, bench_jobs, processes
 from vinemap.bench import Bar, Run
 from vinemap.errors import ConfigError, VinemapError
 
@@ -49,14 +49,14 @@ def test_growth(exponent):
 
 def test_memory_of_processes_is_summed():
     held = "x = bytearray(60_000_000); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(1.5)"
-    with bench.summed_memory() as most:
+    with processes.summed_memory() as most:
         children = [subprocess.Popen([sys.executable, "-c", held]) for _ in range(2)]
         for child in children:
             child.wait()
     if not Path("/proc/self/statm").is_file():
         pytest.skip("needs /proc, which this system hasn't")
     assert 120e6 < most[0] < 250e6
-    assert bench.resident(children[0].pid) == 0
+    assert processes.resident(children[0].pid) == 0
 
 
 def test_a_survey_of_many_parcels(tmp_path):
@@ -114,17 +114,19 @@ def test_sizes_are_numbers():
 
 
 def test_processes_are_measured_and_stopped():
-    done = bench.run_process([sys.executable, "-c", "x = bytearray(100_000_000)"])
+    done = processes.run_process([sys.executable, "-c", "x = bytearray(100_000_000)"])
     assert done.code == 0
     assert done.seconds > 0
     assert done.peak > 100e6
-    failed = bench.run_process([sys.executable, "-c", "import sys; print('why', file=sys.stderr); sys.exit('no luck')"])
+    failed = processes.run_process(
+        [sys.executable, "-c", "import sys; print('why', file=sys.stderr); sys.exit('no luck')"]
+    )
     assert (failed.code, failed.said) == (1, "no luck")
-    hung = bench.run_process([sys.executable, "-c", "import time; time.sleep(60)"], limit=0.3)
+    hung = processes.run_process([sys.executable, "-c", "import time; time.sleep(60)"], limit=0.3)
     assert hung.code < 0
     assert hung.said == "stopped after 0.3 s"
     with pytest.raises(VinemapError, match="ended with code 1: no luck"):
-        bench.must([sys.executable, "-c", "import sys; sys.exit('no luck')"])
+        processes.must([sys.executable, "-c", "import sys; sys.exit('no luck')"])
 
 
 def test_the_document_is_filled(tmp_path):
@@ -185,7 +187,7 @@ def test_an_alternative_that_fails_costs_nothing(tmp_path, monkeypatch):
     files = {"cloud": "none.laz", "boundary": "none.gpkg", "truth": "none.gpkg"}
     monkeypatch.setattr(bench, "ensure_survey", lambda *_: files)
     monkeypatch.setattr(bench, "find_spec", lambda module: module == "cv2" or None)
-    monkeypatch.setattr(bench, "run_process", lambda *_, **__: bench.Outcome(-9, 600.0, 1, "stopped after 600 s"))
+    monkeypatch.setattr(bench, "run_process", lambda *_, **__: processes.Outcome(-9, 600.0, 1, "stopped after 600 s"))
     stages = bench.with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
     lines = bench.instead(1, run(1)._replace(seconds=stages), tmp_path)
     assert lines[-1] == ["c-gons", "cv2", "–", "stopped after 600 s", "–", "–"]

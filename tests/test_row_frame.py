@@ -2,8 +2,19 @@
 
 import numpy as np
 import pytest
+from pyproj import CRS
 
-from vinemap.row_frame import between, extend, resample, row_coordinates, runs_above, way_along, whittaker
+from vinemap.cloud import PointCloud
+from vinemap.row_frame import between, extend, points_of_rows, resample, runs_above, way_along, whittaker
+
+
+def row_coordinates(xyz, curves, reach):
+    """Coordinates of a small cloud's points, which are one group."""
+    cloud = PointCloud(xyz, CRS.from_epsg(32632))
+    ((rows, near, taken),) = points_of_rows(cloud, curves, reach, lambda part, member: (part.xyz[member, 2],))
+    assert rows.tolist() == list(range(len(curves)))
+    assert np.array_equal(taken[0], xyz[near.member, 2])
+    return near
 
 
 def test_coordinates_on_an_arc():

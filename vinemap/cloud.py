@@ -59,10 +59,6 @@ class PointCloud:
         del near, reach
         yield self
 
-    def groups(self, rows: Sequence[Values]) -> list[NDArray[np.int64]]:
-        """Indices of rows, as curves, whose points' frames are worked together."""
-        return row_groups(rows, self.size)
-
     def bins(self, grid: Grid) -> Bins:
         """The points sorted into the cells of a grid; kept until another grid's are asked for, or all is forgotten."""
         if "bins" not in self._kept or self._kept["bins"].grid != grid:
@@ -77,18 +73,6 @@ class PointCloud:
     def above(self, dtm: Raster) -> PointCloud:
         """The cloud with its heights above a terrain model."""
         return replace(self, heights=above(dtm, self.xyz))
-
-
-ROWS_AT_ONCE = 4_000_000
-"""Points, about, of the rows that are worked together."""
-
-
-def row_groups(rows: Sequence[Values], size: int) -> list[NDArray[np.int64]]:
-    """Indices of rows, as curves (k, 2), that lie beside each other in a cloud of so many points, group by group."""
-    middles = np.array([row[len(row) // 2] for row in rows])
-    widest = int(np.argmax(np.ptp(middles, axis=0)))
-    groups = min(max(1, round(size / ROWS_AT_ONCE)), len(rows))
-    return [np.sort(part) for part in np.array_split(np.argsort(middles[:, widest], kind="stable"), groups)]
 
 
 class Sections(NamedTuple):

@@ -100,20 +100,7 @@ def open_cloud(
     Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
     :func:`read_cloud`.
     """
-    import laspy  # 0.4 s of start-up
-
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        reader = laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed())
-    except OURS:
-        raise
-    except BaseException as error:
-        raise _unreadable(path, error) from error
-    with reader:
-        _check_end(reader.header, path)
-        source = crs or _stated_crs(reader.header, path)
-        _check_header(reader.header, source, path)
+    with opened(path, crs=crs) as (reader, source):
         box = _small_box(reader.header, source, around) if around else None
         found = _query(path, box) if box else None
         chunks = _usable_chunks(reader, path, found)
@@ -126,6 +113,32 @@ def open_cloud(
         metric = (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
         with ahead(metric) as prepared:
             yield target, vertical_name(source), prepared
+
+
+@contextmanager
+def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS]]:
+    """Open a LAS, LAZ or COPC file: gives laspy's reader, its header checked, and the CRS of its coordinates.
+
+    Raises
+    ------
+    InputError
+        If it can't be opened, or its header tells of nothing that could be read.
+    """
+    import laspy  # 0.4 s of start-up
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        reader = laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed())
+    except OURS:
+        raise
+    except BaseException as error:
+        raise unreadable(path, error) from error
+    with reader:
+        _check_end(reader.header, path)
+        source = crs or _stated_crs(reader.header, path)
+        _check_header(reader.header, source, path)
+        yield reader, source
 
 
 def write_classified(
@@ -231,14 +244,19 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Point
     except OURS:
         raise
     except BaseException as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
 
 
+def is_copc(header: Any) -> bool:
+    """Whether a header is that of a COPC file."""
+    return any(record.user_id == "copc" for record in header.vlrs)
+
+
 def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
     """Corners (3,) about a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
-    if not any(record.user_id == "copc" for record in header.vlrs):
+    if not is_copc(header):
         return None
     west, south, east, north = shapely.bounds(project(*around, horizontal(source))).tolist()
     margin = 0.01 * max(east - west, north - south)
@@ -276,7 +294,8 @@ def _none_inside(path: Path) -> InputError:
     return InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
 
 
-def _unreadable(path: Path, error: BaseException) -> InputError:
+def unreadable(path: Path, error: BaseException) -> InputError:
+    """What is said of a file that laspy, lazrs or PDAL can't read."""
     reason = str(error).strip().split("\n")[0] or type(error).__name__
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 

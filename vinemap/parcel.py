@@ -210,7 +210,6 @@ def map_parcel(
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     inputs = list(inputs) or [fingerprint(path) for path in (cloud, boundary) if path]
     with paths.product(folder, drafts) as draft:
-        paths.tiles(draft).mkdir()
         collector = Collector(
             paths.tiles(draft),
             most=settings.reading.max_points or int(share * _most_points()),
@@ -255,7 +254,7 @@ def map_parcel(
                 write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
-        shutil.rmtree(paths.tiles(draft))
+        shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         counts = {"points": points.size, "key_points_found": found.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)

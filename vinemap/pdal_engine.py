@@ -14,7 +14,7 @@ import shapely
 from vinemap.cloud import PointCloud
 from vinemap.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
 from vinemap.errors import DependencyError, InputError
-from vinemap.las import _backends, _check_header, _needed, _stated_crs, _unreadable, boundary_in, collected
+from vinemap.las import OURS, boundary_in, collected, is_copc, opened, unreadable
 from vinemap.tiles import Collector
 
 if TYPE_CHECKING:
@@ -74,14 +74,7 @@ def pdal_versions() -> dict[str, str]:
 def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None) -> PointCloud:
     """Read a LAS, LAZ or COPC file as :func:`vinemap.las.read_cloud` does, with PDAL, and classify its ground.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    crs : CRS, optional
-        CRS of the file's coordinates; needed where the file states none, and preferred to what it states.
-    boundary : (Geometry, CRS), optional
-        Polygon to clip to.
+    Parameters and what else is raised are those of that function.
 
     Returns
     -------
@@ -92,12 +85,8 @@ def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | 
     ------
     DependencyError
         If PDAL can't be loaded.
-    InputError
-        If the file can't be read whole, has no points, no CRS, or coordinates that can't be right.
     """
     load_pdal()
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
     source, target, copc = _look_into(path, crs)
     polygon = boundary_in(boundary, target, path) if boundary else None
     reading = reading_pipeline(path, source=source, target=target, polygon=polygon, copc=copc)
@@ -193,20 +182,14 @@ def ground_pipeline(
 
 def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool]:
     """CRS of a file's coordinates, CRS to work it in, and whether it is a COPC."""
-    import laspy  # 0.4 s of start-up
-
-    try:
-        with laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed()) as reader:
-            header = reader.header
-            source = crs or _stated_crs(header, path)
-            _check_header(header, source, path)
+    with opened(path, crs=crs) as (reader, source):
+        try:
             some = reader.read_points(SAMPLE)
-            copc = any(record.user_id == "copc" for record in header.vlrs)
-    except InputError:
-        raise
-    except Exception as error:  # laspy and lazrs raise many kinds, a Rust panic among them
-        raise _unreadable(path, error) from error
-    return source, metric_crs(source, float(np.median(some.x)), float(np.median(some.y))), copc
+        except OURS:
+            raise
+        except BaseException as error:
+            raise unreadable(path, error) from error
+        return source, metric_crs(source, float(np.median(some.x)), float(np.median(some.y))), is_copc(reader.header)
 
 
 def _run(pipeline: Any, path: Path) -> NDArray[np.void]:
@@ -214,7 +197,7 @@ def _run(pipeline: Any, path: Path) -> NDArray[np.void]:
     try:
         pipeline.execute()
     except RuntimeError as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     parts: NDArray[np.void] = np.concatenate(pipeline.arrays)
     return parts
 

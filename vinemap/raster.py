@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 MAX_CELLS = 80_000_000
-"""Cells of the finest raster, 0.8 km² at 0.1 m: with what is derived from it they take some 8 GB."""
+"""Cells of the finest raster, 0.8 km² at 0.1 m."""
 NODATA = -9999.0
 
 

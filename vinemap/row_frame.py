@@ -30,6 +30,10 @@ GUIDE = 0.25
 """Metres between the points of a curve to which cloud points are referred, and the cells of their lookup."""
 
 
+ROWS_AT_ONCE = 4_000_000
+"""Points, about, of the rows that are worked together."""
+
+
 class RowCoordinates(NamedTuple):
     """Points near rows in the frame of the nearest one, row by row."""
 
@@ -70,12 +74,12 @@ def points_of_rows(
     """Refer a cloud's points within ``reach`` (rows,) metres of their nearest curve (k, 2) to it.
 
     Yields rows (a,), the frame's coordinates of their points row by row, and for each point what ``take`` tells of a
-    part of the cloud and its members: arrays (n,). Group by group of rows, so that
-    they don't take the memory of another cloud.
+    part of the cloud and its members: arrays (n,). Group by group of rows, so that they don't take the memory of
+    another cloud.
     """
     if not curves:
         return
-    for rows in cloud.groups(curves):
+    for rows in _groups(curves, cloud.size):
         lookup = _lookup(curves, reach, rows)
         within = np.full(len(curves), -1.0)
         within[rows] = reach[rows]
@@ -86,9 +90,12 @@ def points_of_rows(
         yield rows, *_joined(found, rows)
 
 
-def row_coordinates(xyz: Values, curves: Sequence[Values], reach: Values) -> RowCoordinates:
-    """Refer the points (n, ≥2) within ``reach`` (rows,) metres of their nearest curve (k, 2) to it."""
-    return _coordinates(xyz, _lookup(curves, reach, np.arange(len(curves))), reach.astype(float))
+def _groups(rows: Sequence[Values], size: int) -> list[NDArray[np.int64]]:
+    """Indices of rows, as curves (k, 2), that lie beside each other in a cloud of so many points, group by group."""
+    middles = np.array([row[len(row) // 2] for row in rows])
+    widest = int(np.argmax(np.ptp(middles, axis=0)))
+    groups = min(max(1, round(size / ROWS_AT_ONCE)), len(rows))
+    return [np.sort(part) for part in np.array_split(np.argsort(middles[:, widest], kind="stable"), groups)]
 
 
 def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int64]) -> tuple[RowCoordinates, Taken]:

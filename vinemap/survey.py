@@ -7,7 +7,7 @@ from concurrent.futures import TimeoutError as OutOfTime
 from concurrent.futures import as_completed
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pebble import ProcessExpired, ProcessPool
 
@@ -151,9 +151,9 @@ def _begin(cores: int) -> None:
     compiled.use_cores(cores)
 
 
-def _work(cloud: Path, folder: Path, parcel: str, piece: Piece | None, drafts: Path, **options: object) -> Summary:
+def _work(cloud: Path, folder: Path, parcel: str, piece: Piece | None, drafts: Path, **options: Any) -> Summary:
     try:
-        return map_parcel(cloud, folder, parcel=parcel, piece=piece, drafts=drafts, **options)  # type: ignore[arg-type]
+        return map_parcel(cloud, folder, parcel=parcel, piece=piece, drafts=drafts, **options)
     finally:
         if piece:
             piece.path.unlink(missing_ok=True)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
 
-from vinemap.cloud import PointCloud, row_groups
+from vinemap.cloud import PointCloud
 from vinemap.raster import extent, squares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
     from pyproj import CRS
@@ -71,10 +71,6 @@ class TiledCloud:
                 part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
                 yield part.above(self.dtm) if self.dtm else part
 
-    def groups(self, rows: Sequence[NDArray[np.floating]]) -> list[NDArray[np.int64]]:
-        """Indices of rows, as curves, whose points fit in memory together."""
-        return row_groups(rows, self.size)
-
     def forget(self) -> None:
         """Nothing is kept for speed."""
 
@@ -89,8 +85,8 @@ Cloud = PointCloud | TiledCloud
 class Collector:
     """Takes points chunk by chunk: in memory up to a number of them, in tiles in a folder beyond it."""
 
-    def __init__(self, folder: Path | None = None, *, most: float = np.inf, block: float = 1.0) -> None:
-        """Without a folder all stay in memory; ``block`` is the side in metres of squares that no tile divides."""
+    def __init__(self, folder: Path = Path("tiles"), *, most: float = np.inf, block: float = 1.0) -> None:
+        """``folder`` is made where it is needed; ``block`` is the side in metres of squares that no tile divides."""
         self.folder, self.most, self.block = folder, most, block
         self.xyz = np.empty((0, 3))
         self.tiles: dict[Path, Tile] = {}
@@ -99,7 +95,7 @@ class Collector:
     def add(self, xyz: Points) -> None:
         """Take points (n, 3)."""
         before, self.size = self.size, self.size + len(xyz)
-        if self.folder is None or self.size <= self.most:
+        if self.size <= self.most:
             # Grown in place: a list of chunks joined at the end would take twice the memory.
             self.xyz.resize((self.size, 3), refcheck=False)
             self.xyz[before:] = xyz
@@ -118,14 +114,10 @@ class Collector:
             return PointCloud(self.xyz, crs, vertical)
         tiles, first = [], 0
         for tile in sorted(self.tiles.values()):
-            if (tile.low < least).any() or (tile.high > most).any():
-                xyz = np.fromfile(tile.path).reshape(-1, 3)
-                xyz = xyz[((xyz >= least) & (xyz <= most)).all(axis=1)]
-                xyz.tofile(tile.path)
-                tile = Tile(tile.path, *extent(xyz), len(xyz))  # noqa: PLW2901
-            if tile.size:
-                tiles.append(tile._replace(first=first))
-                first += tile.size
+            kept = _between(tile, least, most)
+            if kept.size:
+                tiles.append(kept._replace(first=first))
+                first += kept.size
         return TiledCloud(tiles, crs, vertical)
 
     def sample(self, n: int) -> Points:
@@ -142,7 +134,7 @@ class Collector:
     def _to_tiles(self, xyz: Points) -> None:
         if len(xyz) == 0:
             return
-        assert self.folder is not None  # noqa: S101
+        self.folder.mkdir(exist_ok=True)
         blocks = max(1, round(SIDE / self.block))
         column, row = (held // blocks for held in squares(np.clip(xyz[:, :2], -FARTHEST, FARTHEST), self.block))
         tile = (column - column.min()) * (np.ptp(row) + 1) + row - row.min()
@@ -157,3 +149,13 @@ class Collector:
             low, high = extent(points)
             old = self.tiles.get(path, Tile(path, low, high, 0))
             self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))
+
+
+def _between(tile: Tile, least: Points, most: Points) -> Tile:
+    """A tile, on disk too, with no points but those between two corners (3,)."""
+    if (tile.low >= least).all() and (tile.high <= most).all():
+        return tile
+    xyz = np.fromfile(tile.path).reshape(-1, 3)
+    xyz = xyz[((xyz >= least) & (xyz <= most)).all(axis=1)]
+    xyz.tofile(tile.path)
+    return Tile(tile.path, *extent(xyz), len(xyz))

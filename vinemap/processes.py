@@ -1,0 +1,103 @@
+"""Processes that are measured: how long they take, and what memory they and theirs hold."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from vinemap.errors import VinemapError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+
+class Outcome(NamedTuple):
+    """What came of a process."""
+
+    code: int
+    seconds: float
+    peak: int
+    """Most resident memory in bytes."""
+    said: str
+    """The last line of its stderr."""
+
+
+def run_process(command: Sequence[str], *, limit: float | None = None) -> Outcome:
+    """Run a command, kill it after ``limit`` seconds, and measure it."""
+    with tempfile.TemporaryFile() as stderr:
+        began = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr)  # noqa: S603 - our own
+        timer = threading.Timer(limit or threading.TIMEOUT_MAX, process.kill)
+        timer.daemon = True
+        timer.start()
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except BaseException:
+            process.kill()
+            raise
+        finally:
+            timer.cancel()
+        seconds = time.perf_counter() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+        stderr.seek(0)
+        said = stderr.read().decode(errors="replace").strip().split("\n")[-1]
+    if limit and seconds >= limit:
+        said = f"stopped after {limit:g} s"
+    return Outcome(process.returncode, seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024), said)
+
+
+def must(command: Sequence[str]) -> Outcome:
+    """Run a command that has to go well.
+
+    Raises
+    ------
+    VinemapError
+        If it doesn't.
+    """
+    outcome = run_process(command)
+    if outcome.code:
+        raise VinemapError(f"{' '.join(command[1:4])} ended with code {outcome.code}: {outcome.said}")
+    return outcome
+
+
+@contextmanager
+def summed_memory() -> Iterator[list[int]]:
+    """Give what all processes begun meanwhile hold together (bytes), at the most; 0 where the system doesn't tell."""
+    most, done = [0], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.1):
+            most[0] = max(most[0], sum(map(resident, descendants(os.getpid()))))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield most
+    finally:
+        done.set()
+        watcher.join()
+
+
+def descendants(process: int) -> list[int]:
+    """Processes that a process has begun, and those that they have."""
+    try:
+        files = list(Path(f"/proc/{process}/task").glob("*/children"))
+        children = [int(word) for file in files for word in file.read_text().split()]
+    except OSError:
+        return []
+    return children + [one for child in children for one in descendants(child)]
+
+
+def resident(process: int) -> int:
+    """Memory (bytes) that a process holds; 0 if it has gone."""
+    try:
+        return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
