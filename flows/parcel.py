@@ -48,10 +48,9 @@ def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
             cloud,
             paths.product_folder(survey, parcel),
             parcel=parcel,
-            settings=config.settings,
             boundary=boundary,
             crs=parse_crs(config.crs) if config.crs else None,
-            origin=config.origin,
+            **dict(config.of_parcel(parcel)),
             step=as_tasks(show),
         )
 

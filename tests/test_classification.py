@@ -6,9 +6,9 @@ import pytest
 
 from vinemap.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
 from vinemap.cloud import PointCloud
-from vinemap.config import Settings
 from vinemap.las import write_classified
 from vinemap.parcel import find_canopies, map_rows
+from vinemap.settings import Settings
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,9 @@
 
 import pytest
 
-from vinemap.config import Settings, check_name, choose_parcel, load_settings, load_survey
+from vinemap.config import check_name, choose_parcel, load_settings, load_survey
 from vinemap.errors import ConfigError
+from vinemap.settings import Settings
 
 SURVEY = "survey: barolo\nparcels: [F, curved, blocks]\n"
 
@@ -40,7 +41,7 @@ def test_survey_with_settings(write):
         ),
         (SURVEY + "settings: {cover: {low: 3}}\n", r"low (3.0) must be below high (2.9)"),
         (SURVEY + "settings: {polygon: {c: 4}}\n", "settings.polygon.c = 4"),
-        ("survey: barolo\n", "parcels is missing"),
+        ("parcels: [F]\n", "survey is missing"),
         ("survey: ../x\nparcels: [F]\n", "'../x' can't name a file"),
         ("survey: [\n", "no valid YAML"),
         ("just words\n", "the file = 'just words'"),

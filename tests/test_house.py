@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
-BASE = {"errors", "crs", "compiled"}
+BASE = {"errors", "crs", "compiled", "machine"}
 DATA = {"cloud", "raster", "vector", "mesh", "row_frame", "zones", "bins", "las", "pieces", "tiles", "pdal_engine"}
 STAGES = {
     "ground",
@@ -30,13 +30,14 @@ STAGES = {
 }
 STAGES |= {"sections", "canopy", "cgon", "section_table", "classification", "odometry"}
 BESIDE = {"evaluate", "synthetic", "scenes"}
-SETTINGS = {"config", "paths"}
+SETTINGS = {"settings", "config", "paths"}
 CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
 # What each module of vinemap, and any flow, may import of vinemap. Its version is everyone's.
 MAY_IMPORT = {
     "__init__": set(),
     "errors": set(),
-    "compiled": set(),
+    "compiled": {"machine"},
+    "machine": set(),
     "crs": {"errors"},
     "style": set(),
     "tables": set(),
@@ -45,16 +46,23 @@ MAY_IMPORT = {
     **dict.fromkeys(STAGES, BASE | DATA),
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
     "scenes": BASE | {"synthetic"},
-    **dict.fromkeys(SETTINGS, BASE),
+    "settings": set(),
+    "config": BASE | {"settings"},
+    "template": {"settings", "config"},
+    "paths": set(),
+    "store": {"errors", "paths"},
+    "recipe": CHAIN,
+    "notices": CHAIN,
     "product": CHAIN,
-    "parcel": CHAIN | {"product"},
-    "survey": CHAIN | {"parcel", "product"},
+    "parcel": CHAIN | {"product", "recipe", "notices", "store"},
+    "workers": BASE,
+    "survey": CHAIN | {"parcel", "recipe", "store", "workers", "dask_engine"},
     "canopy_accuracy": CHAIN | {"parcel"},
     "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
     "bench_jobs": CHAIN | {"parcel"},
     "bench": {"errors", "paths", "tables", "processes", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
-    "cli": CHAIN | {"parcel", "survey"},
+    "cli": CHAIN | {"parcel", "survey", "template"},
     "__main__": {"cli"},
     "flows": CHAIN | {"parcel", "cli", "flows"},
 }

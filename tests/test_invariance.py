@@ -5,8 +5,8 @@ import pytest
 import shapely
 
 from vinemap.cloud import PointCloud
-from vinemap.config import Settings
 from vinemap.parcel import map_rows
+from vinemap.settings import Settings
 
 PLACE = np.array([500_000.0, 4_900_000.0])
 

@@ -18,7 +18,6 @@ import shapely
 from pyproj import CRS, Transformer
 
 from vinemap import paths, pdal_engine
-from vinemap.config import GroundOptions, Settings
 from vinemap.errors import DependencyError, InputError
 from vinemap.evaluate import evaluate_rows
 from vinemap.ground import terrain_model
@@ -26,6 +25,7 @@ from vinemap.las import read_cloud
 from vinemap.parcel import map_parcel
 from vinemap.pdal_engine import ground_pipeline, read_cloud_pdal, reading_pipeline
 from vinemap.raster import sample
+from vinemap.settings import GroundOptions, Settings
 from vinemap.synthetic import write_survey
 from vinemap.vector import read_boundary
 

@@ -13,7 +13,6 @@ from pyproj import CRS
 from vinemap.canopy import find_feet, foliage_reach, living_canopies, separate_canopy
 from vinemap.cgon import peel_sections
 from vinemap.cloud import NO_SECTIONS, PointCloud, Sections, join
-from vinemap.config import Settings
 from vinemap.ground import terrain_model
 from vinemap.parcel import model_sections
 from vinemap.raster import Grid, Raster
@@ -26,6 +25,7 @@ from vinemap.section_table import (
     tabulate_sections,
 )
 from vinemap.sections import cut_sections
+from vinemap.settings import Settings
 
 UTM = CRS.from_epsg(32632)
 

@@ -7,22 +7,20 @@ import sqlite3
 import subprocess
 import sys
 import time
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as OutOfTime
 
 import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
-from pebble import ProcessExpired
 
 from vinemap import paths
-from vinemap.errors import InputError, OutputError
+from vinemap.config import survey_config
+from vinemap.errors import InputError, OutputError, WorkerError
 from vinemap.las import read_cloud
-from vinemap.parcel import Summary, map_parcel
+from vinemap.parcel import map_parcel
 from vinemap.pieces import read_piece, split_cloud
 from vinemap.scenes import hillside, rows_of
-from vinemap.survey import Outcome, _outcome, map_survey
+from vinemap.survey import DONE, FAILED, map_survey
 from vinemap.synthetic import Vineyard, simulate, write_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
@@ -58,8 +56,13 @@ def mapped(cloud, boundaries, tmp_path_factory):
     """Outcomes of a job with a parcel that isn't there and one without points, and the folder of its products."""
     folder = tmp_path_factory.mktemp("job") / "products"
     parcels = ["nobody's", "A", "B", "C", "inner A", "empty"]
-    outcomes = list(map_survey(cloud, folder, parcels=parcels, boundaries=boundaries))
+    outcomes = list(job(cloud, folder, parcels=parcels, boundaries=boundaries))
     return {outcome.parcel: outcome for outcome in outcomes}, folder
+
+
+def job(cloud, folder, *, boundaries, again=False, step=None, **options):
+    config = survey_config(survey="three", cloud=cloud, boundaries=boundaries, **options)
+    return map_survey(config, folder, again=again, **({"step": step} if step else {}))
 
 
 def contents(path):
@@ -82,8 +85,8 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
     outcomes, folder = mapped
     alone = tmp_path / parcel
     summary = map_parcel(cloud, alone, parcel=parcel, boundary=boundaries)
-    found = outcomes[parcel].summary
-    assert (found.rows, found.length, found.folder) == (summary.rows, summary.length, folder / parcel)
+    found = outcomes[parcel]
+    assert (found.state, found.rows, found.length) == (DONE, summary.rows, round(summary.length, 3))
     assert found.rows > 0
     names = sorted(path.name for path in alone.iterdir())
     assert sorted(path.name for path in (folder / parcel).iterdir()) == names
@@ -100,35 +103,27 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
 def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
     outcomes, folder = mapped
     assert set(outcomes) == {"nobody's", "A", "B", "C", "inner A", "empty"}
-    assert outcomes["nobody's"].summary is None
+    assert outcomes["nobody's"].state == FAILED
     assert f'{boundaries}: none of its 5 polygons has "nobody\'s" in a column' in outcomes["nobody's"].line()
     assert outcomes["empty"].line().startswith("empty: failed: ")
     assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
-    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "inner A"]
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "inner A", "survey.json"]
     assert [path.name for path in folder.parent.iterdir()] == ["products"]
 
 
 def test_too_short_a_limit_leaves_nothing(cloud, boundaries, tmp_path):
     folder = tmp_path / "new" / "products"
-    outcomes = list(map_survey(cloud, folder, parcels=["A", "B", "C"], boundaries=boundaries, limit=0.01))
-    assert sorted(outcome.line() for outcome in outcomes) == [
-        f"{parcel}: failed: took longer than 0.01 s" for parcel in "ABC"
-    ]
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(WorkerError, match=r"three\.laz: can't be read: took longer than 0\.02 s"):
+        list(job(cloud, folder, parcels=["A", "B"], boundaries=boundaries, job={"limit": 0.01}))
+    assert [path.name for path in folder.iterdir()] == ["survey.json"]
 
 
 def test_earlier_products_outlive_a_failure(cloud, boundaries, tmp_path):
     (tmp_path / "A").mkdir()
     (tmp_path / "A" / "kept.txt").write_text("kept")
-    (outcome,) = map_survey(cloud, tmp_path, parcels=["A"], boundaries=boundaries, limit=0.01)
-    assert outcome.summary is None
-    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["A", "A/kept.txt"]
-
-
-def test_no_parcel_at_all_needs_no_cloud(boundaries, tmp_path):
-    outcomes = list(map_survey(tmp_path / "none.laz", tmp_path / "out", parcels=["X", "Y"], boundaries=boundaries))
-    assert [outcome.parcel for outcome in outcomes] == ["X", "Y"]
-    assert list(tmp_path.iterdir()) == []
+    (outcome,) = job(cloud, tmp_path, parcels=["A"], boundaries=boundaries, job={"limit": 0.01})
+    assert outcome.line() == "A: failed: took longer than 0.01 s"
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")} == {"A", "A/kept.txt", "survey.json"}
 
 
 def test_a_cloud_that_cannot_be_read_is_the_whole_jobs_fault(cloud, boundaries, tmp_path):
@@ -136,56 +131,27 @@ def test_a_cloud_that_cannot_be_read_is_the_whole_jobs_fault(cloud, boundaries, 
     cut.write_bytes(cloud.read_bytes()[:200_000])
     for path, reason in ((cut, r"cut\.laz: "), (tmp_path / "none.laz", "no such file")):
         with pytest.raises(InputError, match=reason):
-            list(map_survey(path, tmp_path / "new" / "out", parcels=["A", "B"], boundaries=boundaries))
-        assert [path.name for path in tmp_path.iterdir()] == ["cut.laz"]
+            list(job(path, tmp_path / "new" / "out", parcels=["A", "B"], boundaries=boundaries))
+        assert not {path.name for path in tmp_path.rglob("*")} - {"cut.laz", "new", "out", "survey.json"}
 
 
 def test_a_folder_that_cannot_be_written(cloud, boundaries, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=r"file/out: can't be written \(Not a directory\): choose another folder"):
-        list(map_survey(cloud, tmp_path / "file" / "out", parcels=["A", "B"], boundaries=boundaries))
+        list(job(cloud, tmp_path / "file" / "out", parcels=["A", "B"], boundaries=boundaries))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_whoever_asks_for_no_more_outcomes_stops_the_job(cloud, boundaries, tmp_path):
     folder = tmp_path / "out"
-    outcomes = map_survey(cloud, folder, parcels=["A", "B", "C", "inner A"], boundaries=boundaries, workers=1)
+    outcomes = job(cloud, folder, parcels=["A", "B", "C", "inner A"], boundaries=boundaries, job={"workers": 1})
     first = next(outcomes)
-    assert first.summary
+    assert first.state == DONE
     outcomes.close()
-    done = sorted(path.name for path in folder.iterdir())
+    done = sorted(path.name for path in folder.iterdir() if path.is_dir())
     assert first.parcel in done
     assert len(done) < 4
     assert all((folder / name / "run.json").is_file() for name in done)
-
-
-def ended(error=None, value=None):
-    job = Future()
-    job.set_exception(error) if error else job.set_result(value)
-    return job
-
-
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (InputError("a.laz: no such file"), "a.laz: no such file"),
-        (OutOfTime("Task timeout", 5.0), "took longer than 5 s"),
-        (ProcessExpired("Abnormal termination", code=-9, pid=17), "its process died (code -9)"),
-        (MemoryError(), "not enough memory"),
-        (ZeroDivisionError("oops"), "a fault of vinemap's own (ZeroDivisionError: oops)"),
-        (RuntimeError("two\nlines"), "a fault of vinemap's own (RuntimeError: two lines)"),
-    ],
-)
-def test_what_became_of_a_parcel(error, reason):
-    outcome = _outcome("F", ended(error), 5.0)
-    assert outcome.summary is None
-    assert outcome.line() == f"F: failed: {reason}"
-
-
-def test_what_was_found_in_a_parcel(tmp_path):
-    summary = Summary("F", tmp_path, 16, 2345.6, 1.25)
-    assert _outcome("F", ended(value=summary), None) == Outcome("F", summary)
-    assert Outcome("F", summary).line() == f"F: 16 rows, 2,346 m, in 1.2 s → {tmp_path}"
 
 
 @pytest.mark.parametrize("most", [np.inf, 1000])
@@ -216,14 +182,14 @@ def test_the_command(cloud, boundaries, tmp_path):
     lines = sorted(done.stdout.splitlines())
     assert [line.split(": ")[0] for line in lines] == ["A", "B", "C"]
     assert lines[0].startswith("A: 4 rows, ")
-    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C"]
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "survey.json"]
     words = "--boundaries", boundaries, "--parcel", "B", "--parcel", "empty", "--out", "out"
     done = vinemap("survey", cloud, *words, cwd=tmp_path)
     assert done.returncode == 1
     assert done.stdout.startswith("B: 4 rows, ")
     assert done.stdout.count("\n") == done.stderr.count("\n") == 1
     assert done.stderr.startswith("empty: failed: ")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["B"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["B", "survey.json"]
 
 
 @pytest.mark.parametrize(
@@ -232,7 +198,7 @@ def test_the_command(cloud, boundaries, tmp_path):
         (["none.laz", "--boundaries", "{b}"], "none.laz: no such file"),
         (["{c}", "--boundaries", "none.gpkg"], "none.gpkg: no such file"),
         (["{c}", "--boundaries", "{b}", "--parcel", "../A"], "can't name a file"),
-        (["{c}", "--boundaries", "{b}", "--limit", "0"], "--limit"),
+        (["{c}", "--boundaries", "{b}", "--limit", "0"], "job.limit = 0.0: input should be greater than 0"),
         (["{c}", "--boundaries", "{b}", "--crs", "EPSG:99"], "EPSG:99"),
         (["{c}"], "--boundaries"),
     ],
@@ -277,7 +243,8 @@ def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     while children(job.pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert children(job.pid) == []
-    done = {path.name for path in (tmp_path / "out").iterdir()}
+    done = {path.name for path in (tmp_path / "out").iterdir() if path.is_dir()}
+    assert not [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
     assert {line.split(":")[0] for line in (first + rest).splitlines()} <= done
     assert len(done) < 30
     assert all((tmp_path / "out" / name / "run.json").is_file() for name in done)

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from vinemap import paths
 from vinemap.canopy import section_meshes
 from vinemap.cloud import PointCloud
-from vinemap.config import Settings
 from vinemap.crs import Origin
 from vinemap.evaluate import evaluate_rows
 from vinemap.ground import terrain_model
@@ -23,6 +22,7 @@ from vinemap.las import read_cloud
 from vinemap.mesh import volume
 from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
 from vinemap.section_table import modelling_indices, summarise_rows
+from vinemap.settings import Settings
 from vinemap.vector import read_boundary
 
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)

@@ -16,12 +16,12 @@ from pyproj import CRS
 
 from vinemap import paths
 from vinemap.cloud import PointCloud
-from vinemap.config import ReadingOptions, Settings
 from vinemap.errors import InputError, OutputError
 from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.las import collected
 from vinemap.parcel import call, map_parcel, map_rows, model_canopies
 from vinemap.raster import grid_over, squares, window
+from vinemap.settings import ReadingOptions, Settings
 from vinemap.synthetic import write_survey
 from vinemap.tiles import Collector, TiledCloud
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from vinemap.config import Settings
 from vinemap.parcel import map_rows
+from vinemap.settings import Settings
 from vinemap.synthetic import write_survey
 from vinemap.tune import BOUNDS, main, reference_model, score, search, some_rows
 

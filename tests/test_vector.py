@@ -11,7 +11,7 @@ import shapely
 
 from vinemap.errors import InputError
 from vinemap.style import alias
-from vinemap.vector import LAYERS, conform, parcel_names, read_boundary, write_geopackage
+from vinemap.vector import LAYERS, conform, read_boundary, read_parcels, write_geopackage
 
 CONTRACT = {
     "rows": (
@@ -147,7 +147,7 @@ def polygons(path, **columns):
 )
 def test_names_of_parcels(tmp_path, columns, names):
     path, squares = polygons(tmp_path / "b.gpkg", **columns)
-    assert parcel_names(path) == names
+    assert list(read_parcels(path)) == names
     for name, square in zip(names, squares, strict=True):
         assert read_boundary(path, parcel=name)[0].equals(square)
 
@@ -155,22 +155,22 @@ def test_names_of_parcels(tmp_path, columns, names):
 def test_no_column_names_each_parcel(tmp_path):
     path, _ = polygons(tmp_path / "b.gpkg", name=["A", "A", "C"], plot=["P", None, "Q"])
     with pytest.raises(InputError, match=r"b\.gpkg: no column has a name of its own for each of its 3 polygons"):
-        parcel_names(path)
+        read_parcels(path)
     bare = tmp_path / "bare.geojson"
     gpd.GeoDataFrame(geometry=[shapely.box(0, 0, 1, 1)], crs=32632).to_file(bare)
     with pytest.raises(InputError, match="no column has a name"):
-        parcel_names(bare)
+        read_parcels(bare)
 
 
 def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):
     """Numbers of plots, say, that are those of other parcels in another column."""
     path, squares = polygons(tmp_path / "b.gpkg", block=["B", "A", "A"], name=["A", "B", "C"], code=[2, 1, 3])
-    assert parcel_names(path) == ["A", "B", "C"]
+    assert list(read_parcels(path)) == ["A", "B", "C"]
     for name, square in zip("ABC", squares, strict=True):
         assert read_boundary(path, parcel=name)[0].equals(square)
     assert read_boundary(path, parcel="1")[0].equals(squares[1])
     path, squares = polygons(tmp_path / "c.gpkg", name=["A", None, "1"], id=[1, 2, 3])
-    for name, square in zip(parcel_names(path), squares, strict=True):
+    for name, square in zip(read_parcels(path), squares, strict=True):
         assert read_boundary(path, parcel=name)[0].equals(square)
 
 

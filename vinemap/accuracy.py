@@ -19,11 +19,11 @@ import shapely
 
 from vinemap.canopy_accuracy import CanopyErrors, compare_canopies, pool_canopies
 from vinemap.cloud import PointCloud
-from vinemap.config import PolygonOptions, Settings
 from vinemap.evaluate import evaluate_rows
 from vinemap.parcel import RowMap, map_rows, model_canopies
 from vinemap.raster import Raster, RowField, cell_of, sample, sample_across
 from vinemap.scenes import FAMILIES, family
+from vinemap.settings import PolygonOptions, Settings
 from vinemap.tables import as_markdown, as_text, fill
 
 if TYPE_CHECKING:

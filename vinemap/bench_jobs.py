@@ -323,8 +323,8 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
     import cv2
 
     from vinemap.cgon import enclose, hull
-    from vinemap.config import PolygonOptions, Settings
     from vinemap.parcel import model_canopies
+    from vinemap.settings import PolygonOptions, Settings
 
     _, found = mapped(cloud, boundary)
     outlines = model_canopies(found, Settings(polygon=PolygonOptions(c=OUTLINE))).polygons
@@ -350,9 +350,9 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
 
 def mapped(cloud: str, boundary: str) -> tuple[Array, RowMap]:
     """Points (n, 3) of a parcel, and its rows as they come."""
-    from vinemap.config import Settings
     from vinemap.las import read_cloud
     from vinemap.parcel import map_rows
+    from vinemap.settings import Settings
     from vinemap.vector import read_boundary
 
     points = read_cloud(Path(cloud), boundary=read_boundary(Path(boundary)))

@@ -64,8 +64,9 @@ def run(
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
     from vinemap import paths
-    from vinemap.config import Settings, check_name, load_settings
+    from vinemap.config import check_name, load_settings
     from vinemap.crs import parse_crs
+    from vinemap.settings import Settings
 
     name = check_name(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
@@ -93,8 +94,12 @@ def run(
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
 @click.option("--origin", type=_Origin(), help="Origin of the local frame {Main}; each parcel's corner by default.")
 @click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
-@click.option("--workers", type=click.IntRange(1), help="Parcels worked at once; as many as there are cores.")
-@click.option("--limit", type=click.FloatRange(min=1), help="Seconds that a parcel may take.")
+@click.option("--again", is_flag=True, help="Map parcels that are up to date, too.")
+@click.option("--workers", type=int, help="Parcels worked at once; as many as there are cores.")
+@click.option("--limit", type=float, help="Seconds that a parcel may take; an hour by default.")
+@click.option("--memory", type=float, help="Memory that a parcel may take, in GB; its share of what there is.")
+@click.option("--engine", type=click.Choice(["processes", "dask"]), help="What works the parcels; processes here.")
+@click.option("--scheduler", help="Address of the Dask scheduler, as tcp://host:8786.")
 def survey(
     cloud: Path,
     boundaries: Path,
@@ -103,33 +108,43 @@ def survey(
     out: Path | None,
     origin: Any,
     settings: Path | None,
-    workers: int | None,
-    limit: float | None,
+    again: bool,
+    **job: Any,
 ) -> None:
     """Map many parcels of CLOUD (LAS, LAZ or COPC) in one job; exit code 1 if one of them fails."""
     from vinemap import paths
-    from vinemap.config import Settings, check_name, load_settings
-    from vinemap.crs import parse_crs
-    from vinemap.survey import map_survey
-    from vinemap.vector import parcel_names
+    from vinemap.config import load_settings, survey_config
+    from vinemap.survey import FAILED, map_survey
 
-    outcomes = map_survey(
-        cloud,
-        out or paths.survey_products(paths.stem(cloud)),
-        parcels=[check_name(name) for name in parcels or parcel_names(boundaries)],
+    name = paths.stem(cloud)
+    config = survey_config(
+        survey=name,
+        cloud=cloud,
         boundaries=boundaries,
-        settings=load_settings(settings) if settings else Settings(),
-        crs=parse_crs(crs) if crs else None,
+        parcels=list(parcels) or None,
+        crs=crs,
         origin=origin,
-        workers=workers,
-        limit=limit,
+        settings=load_settings(settings) if settings else None,
+        job={key: value for key, value in job.items() if value is not None},
     )
-    failed = 0
-    for outcome in outcomes:
-        failed += outcome.summary is None
-        click.echo(outcome.line(), err=outcome.summary is None)
+    failed = False
+    for outcome in map_survey(config, out or paths.survey_products(name), again=again):
+        failed |= outcome.state == FAILED
+        click.echo(outcome.line(), err=outcome.state == FAILED)
     if failed:
         sys.exit(1)
+
+
+@commands.command()
+@click.argument("kind", type=click.Choice(["estate", "survey", "settings"]), default="estate")
+def config(kind: str) -> None:
+    """Print all that can be configured, with its defaults, as a commented YAML file.
+
+    KIND is what the file is for: the surveys of an estate night after night, one survey, or the stages alone.
+    """
+    from vinemap.template import template
+
+    click.echo(template(kind), nl=False)
 
 
 @commands.command()

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from numba import njit
 
+from vinemap import machine
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
@@ -23,7 +25,7 @@ F = TypeVar("F", bound="Callable[..., object]")
 S = TypeVar("S")
 T = TypeVar("T")
 
-CORES = os.cpu_count() or 1
+CORES = machine.cores()
 """Cores that this process works on."""
 FEW = 16
 """Items that one core has done before another would have begun."""

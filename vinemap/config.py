@@ -1,4 +1,4 @@
-"""Configuration: one flat model a stage, the settings of a parcel, and the survey that a YAML file describes."""
+"""Configurations in YAML: of one survey, and of an estate whose surveys come night after night."""
 
 from __future__ import annotations
 
@@ -9,214 +9,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
-from vinemap.crs import Origin, check_origin
-from vinemap.errors import ConfigError
+from vinemap.crs import Origin, check_origin, parse_crs
+from vinemap.errors import ConfigError, InputError
+from vinemap.settings import Options, Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from pydantic_core import ErrorDetails
 
-Metres = Annotated[float, Field(gt=0, le=100)]
-M = TypeVar("M", bound="Options")
-Share = Annotated[float, Field(ge=0, le=1)]
+M = TypeVar("M", bound=Options)
+T = TypeVar("T")
 
-FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f]')
+FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]')
 """Characters that a name of a file can't have on one system or another."""
-
-
-class Options(BaseModel):
-    """Strict options: unknown keys are errors, and nothing changes after loading."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ReadingOptions(Options):
-    """Points in memory."""
-
-    max_points: int | None = Field(
-        None, ge=1000, description="points held in memory, more are worked in tiles; none: what half of it holds"
-    )
-
-
-class GroundOptions(Options):
-    """Terrain model."""
-
-    engine: Literal["vinemap", "pdal"] = Field("vinemap", description="ours, or PDAL's readers and its SMRF")
-    resolution: float = Field(0.25, ge=0.05, le=2, description="cell size of the DTM (m)")
-    quantile: float = Field(0.1, gt=0, le=0.5, description="order of the height that stands for a cell's terrain")
-    tolerance: Metres = Field(0.12, description="height above the surface around it at which a cell is terrain (m)")
-    terrace_height: float = Field(1.0, ge=0, le=5, description="height up to which a thin layer is a terrace (m)")
-
-
-class CoverOptions(Options):
-    """Raster of canopy cover."""
-
-    resolution: float = Field(0.1, ge=0.02, le=0.5, description="cell size (m)")
-    low: Metres = Field(0.5, description="height above ground at which canopy begins (m)")
-    high: Metres = Field(2.9, description="height above ground at which it ends (m)")
-    smoothing: float | None = Field(None, gt=0, le=1, description="Gaussian (m); none: the mean point distance")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> CoverOptions:
-        if self.low >= self.high:
-            raise ValueError(f"low ({self.low}) must be below high ({self.high})")
-        return self
-
-
-class RowFieldOptions(Options):
-    """Direction, spacing and likelihood of rows."""
-
-    method: Literal["spectrum", "cylinders"] = Field("spectrum", description="ours, or the thesis's cylinders")
-    window: float = Field(16.0, ge=6, le=60, description="width of the spectrum's windows (m)")
-    radius: float = Field(5.0, ge=2, le=30, description="radius of the cylinders (m)")
-    step: float = Field(2.0, ge=0.5, le=20, description="distance of the windows (m)")
-    min_spacing: float = Field(1.2, ge=0.8, le=10, description="smallest inter-row spacing (m)")
-    max_spacing: float = Field(4.5, ge=0.8, le=10, description="largest inter-row spacing (m)")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> RowFieldOptions:
-        if self.min_spacing >= self.max_spacing:
-            raise ValueError(f"min_spacing ({self.min_spacing}) must be below max_spacing ({self.max_spacing})")
-        if self.method == "cylinders" and self.radius <= self.max_spacing:
-            raise ValueError(f"radius ({self.radius}) must be above max_spacing ({self.max_spacing})")
-        if self.window < 3 * self.max_spacing:
-            raise ValueError(f"window ({self.window}) must hold three times max_spacing ({self.max_spacing})")
-        return self
-
-
-class KeyPointOptions(Options):
-    """Key points of the canopy."""
-
-    grid_step: float = Field(0.5, ge=0.1, le=5, description="distance of the nodes (m)")
-    reach: float = Field(0.6, ge=0.5, le=5, description="reach of a profile to both sides (spacings)")
-    slice_width: Metres = Field(0.5, description="width of a slice along the rows (m)")
-    bin_width: float = Field(0.05, ge=0.01, le=0.5, description="bins of a profile (m)")
-    smoothing: float = Field(0.15, gt=0, le=1, description="Gaussian along a profile (m)")
-    min_cover: Share = Field(0.12, description="cover of a maximum")
-    min_likelihood: Share = Field(0.1, description="vineyard likelihood of a node")
-
-
-class ClusteringOptions(Options):
-    """Clusters of key points."""
-
-    method: Literal["pieces", "ellipse"] = Field("pieces", description="ours, or the thesis's ellipse alone")
-    along: float = Field(1.0, gt=0, le=10, description="semi-axis of the ellipse along the row (spacings)")
-    across: float = Field(0.12, gt=0, le=2, description="semi-axis across the row (spacings)")
-    min_points: int = Field(6, ge=1, description="key points of a piece")
-    max_gap: float = Field(20.0, ge=0, le=100, description="missing vines that a row bridges (m)")
-    track_width: Metres = Field(3.5, description="gap shared by the neighbours that is a track (m)")
-
-
-class CurveOptions(Options):
-    """Courses of rows."""
-
-    threshold: Metres = Field(2.0, description="distance t of the enhanced key points (m)")
-    min_length: Metres = Field(4.0, description="length of a row (m)")
-    min_radius: Metres = Field(8.0, description="radius of the tightest bend (m)")
-    max_width: Metres = Field(1.6, description="width of a row's canopy (m)")
-    min_support: Share = Field(0.25, description="share of a row's length that has canopy")
-
-
-class FitOptions(Options):
-    """Centre lines, ends and gaps of rows."""
-
-    smoothing: Metres = Field(2.5, description="wavelength below which bends are noise (m)")
-    end_share: float = Field(0.6, gt=0, lt=1, description="share of the cover thereabouts at which canopy ends")
-    min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
-
-
-class MissingOptions(Options):
-    """Missing vines."""
-
-    vine_spacing: float | None = Field(None, ge=0.3, le=5, description="distance of vines (m); none: estimated")
-
-
-class SectionOptions(Options):
-    """Sections across the rows."""
-
-    width: float = Field(0.4, ge=0.05, le=2, description="extent a along the row (m)")
-    step: float = Field(0.25, ge=0.05, le=5, description="distance b along the row (m)")
-    min_points: int = Field(45, ge=0, le=1000, description="canopy points for which sections are widened")
-    max_width: float = Field(1.0, ge=0.05, le=5, description="extent to which they may be (m)")
-
-
-class CanopyOptions(Options):
-    """Canopy told from terrain."""
-
-    margin: float = Field(0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins (m)")
-    half_width: Metres = Field(0.9, description="distance from γ at which canopy ends (m)")
-    max_height: Metres = Field(2.9, description="height above terrain at which canopy ends (m)")
-    min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
-    min_points: int = Field(8, ge=3, description="canopy points of a section")
-    min_share: Share = Field(0.15, description="share of the median section's points that a section has")
-    min_height: float = Field(0.8, ge=0, le=5, description="height of a section's highest tenth (m)")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> CanopyOptions:
-        if max(self.margin, self.min_height) >= self.max_height:
-            raise ValueError(f"max_height ({self.max_height}) must be above margin and min_height")
-        return self
-
-
-class PolygonOptions(Options):
-    """Minimum-area polygons."""
-
-    c: int = Field(7, ge=5, le=30, description="vertices of a section's polygon")
-    share: float = Field(0.02, ge=0, le=0.5, description="share of a section's points that is peeled off")
-    foot: Literal["foliage", "soil"] = Field("foliage", description="where v1, v2 and vc stand; the thesis's: soil")
-
-
-class ProductOptions(Options):
-    """What a product holds beside the usual."""
-
-    classified: bool = Field(default=False, description="the cloud with a class and a row for every point, as LAZ")
-    plain: bool = Field(default=False, description="meshes for readers of glTF that know no extension: larger files")
-
-
-class Settings(Options):
-    """Settings of every stage."""
-
-    reading: ReadingOptions = ReadingOptions()
-    ground: GroundOptions = GroundOptions()
-    cover: CoverOptions = CoverOptions()
-    row_field: RowFieldOptions = RowFieldOptions()
-    key_points: KeyPointOptions = KeyPointOptions()
-    clustering: ClusteringOptions = ClusteringOptions()
-    curves: CurveOptions = CurveOptions()
-    fit: FitOptions = FitOptions()
-    missing: MissingOptions = MissingOptions()
-    sections: SectionOptions = SectionOptions()
-    canopy: CanopyOptions = CanopyOptions()
-    polygon: PolygonOptions = PolygonOptions()
-    product: ProductOptions = ProductOptions()
-
-
-class SurveyConfig(Options):
-    """A survey: its cloud, its parcels and the settings for all of them."""
-
-    survey: str = Field(description="name; its data lie in data/surveys/<survey>")
-    cloud: Path | None = Field(None, description="LAS, LAZ or COPC file; data/surveys/<survey>/<survey>.laz by default")
-    boundaries: Path | None = Field(None, description="polygons of the parcels, named in any of their columns")
-    parcels: list[str] = Field(min_length=1, description="names of the parcels")
-    crs: str | None = Field(None, description="CRS of the cloud where the file states none")
-    origin: Origin | None = Field(None, description="origin of {Main}: latitude, longitude (degrees), altitude (m)")
-    simulate: str | None = Field(None, pattern="^barolo$", description="example to simulate where the cloud is missing")
-    settings: Settings = Settings()
-
-    @model_validator(mode="after")
-    def _names(self) -> SurveyConfig:
-        for name in (self.survey, *self.parcels):
-            check_name(name)
-        if self.origin is not None:
-            check_origin(self.origin)
-        if self.simulate not in (None, self.survey):
-            raise ValueError(f"simulate ({self.simulate}) must be the survey's own name ({self.survey})")
-        return self
+DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Names that Windows keeps for itself."""
+LONGEST_NAME = 64
+MOST_BYTES = 160
+"""Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
 
 
 def check_name(name: str) -> str:
-    """Return the name of a parcel or survey if it can be the name of a file.
+    """Return the name of a parcel or survey, its Unicode composed, if it can be the name of a file.
 
     Raises
     ------
@@ -224,21 +41,155 @@ def check_name(name: str) -> str:
         If it is empty, too long, or has characters of paths.
     """
     name = unicodedata.normalize("NFC", name)
-    if not 0 < len(name) <= 64 or FORBIDDEN.search(name) or name[0] in ".- " or name[-1] in ". ":
+    if (
+        not 0 < len(name) <= LONGEST_NAME
+        or FORBIDDEN.search(name)
+        or DEVICES.fullmatch(name)
+        or name[0] in ".- "
+        or name[-1] in ". "
+        or len(name.encode()) > MOST_BYTES
+    ):
         raise ConfigError(f"name {name!r} can't name a file: use letters, digits, spaces, '-' and '_', a letter first")
     return name
 
 
+def _checked(check: Callable[[T], Any]) -> AfterValidator:
+    """A check that raises errors of ours, for pydantic."""
+
+    def checked(value: T) -> T:
+        try:
+            check(value)
+        except (ConfigError, InputError) as error:
+            raise ValueError(str(error)) from error
+        return value
+
+    return AfterValidator(checked)
+
+
+Name = Annotated[str, AfterValidator(lambda name: unicodedata.normalize("NFC", name)), _checked(check_name)]
+MainOrigin = Annotated[Origin, _checked(check_origin)]
+
+
+class JobOptions(Options):
+    """How the parcels of a survey are worked."""
+
+    engine: Literal["processes", "dask"] = Field("processes", description="processes here, or a Dask cluster's workers")
+    scheduler: str | None = Field(None, description="address of the Dask scheduler, as tcp://host:8786")
+    workers: int | None = Field(None, ge=1, le=10_000, description="parcels worked at once; none: the cores' number")
+    limit: float = Field(3600, gt=0, le=1_000_000, description="seconds that a parcel may take")
+    memory: float | None = Field(
+        None, ge=0.5, le=100_000, description="memory that a parcel may take (GB); none: its share of what there is"
+    )
+
+    @model_validator(mode="after")
+    def _reachable(self) -> JobOptions:
+        if (self.engine == "dask") != (self.scheduler is not None):
+            raise ValueError("engine dask and the address of a scheduler go together")
+        return self
+
+
+class ParcelConfig(Options):
+    """What is otherwise in one parcel."""
+
+    origin: MainOrigin | None = Field(None, description="origin of {Main}: latitude, longitude (degrees), altitude (m)")
+    settings: Settings = Settings()
+
+
+class _Surveys(Options):
+    """What is the same for a survey and an estate."""
+
+    boundaries: Path | None = Field(None, description="polygons of the parcels, named in one of their columns")
+    parcels: list[Name] | None = Field(None, min_length=1, description="names of the parcels; none: all that there are")
+    crs: Annotated[str, _checked(parse_crs)] | None = Field(
+        None, description="CRS of the cloud, as EPSG:n, where the file states none or a wrong one"
+    )
+    origin: MainOrigin | None = Field(None, description="origin of {Main}: latitude, longitude (degrees), altitude (m)")
+    settings: Settings = Settings()
+    job: JobOptions = JobOptions()
+    overrides: dict[Name, ParcelConfig] = Field({}, description="what is otherwise in a parcel, by its name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _inherit(cls, data: Any) -> Any:
+        """Give the settings of single parcels what they leave open."""
+        if not isinstance(data, dict) or not isinstance(overrides := data.get("overrides"), dict):
+            return data
+        common = {key: data[key] for key in ("origin", "settings") if key in data}
+        return data | {"overrides": {name: merge(common, own) for name, own in overrides.items()}}
+
+    @model_validator(mode="after")
+    def _known(self) -> _Surveys:
+        for name in self.overrides:
+            if self.parcels and name not in self.parcels:
+                raise ValueError(f"overrides has {name!r}, which isn't among parcels: {_nearest(name, self.parcels)}")
+        return self
+
+    def of_parcel(self, name: str) -> ParcelConfig:
+        """What holds for a parcel."""
+        return self.overrides.get(name) or ParcelConfig(origin=self.origin, settings=self.settings)
+
+
+class SurveyConfig(_Surveys):
+    """A survey: its cloud, its parcels and the settings for all of them."""
+
+    survey: Name = Field(description="name; its data lie in data/surveys/<survey>")
+    cloud: Path | None = Field(None, description="LAS, LAZ or COPC file; data/surveys/<survey>/<survey>.laz by default")
+    simulate: Literal["barolo"] | None = Field(None, description="example to simulate where the cloud is missing")
+
+    @model_validator(mode="after")
+    def _example(self) -> SurveyConfig:
+        if self.simulate and (self.simulate != self.survey or self.cloud):
+            raise ValueError(f"simulate ({self.simulate}) must be the survey's own name, and cloud be left out")
+        return self
+
+
+class EstateConfig(_Surveys):
+    """An estate: the folder its surveys come into, and what holds for all of them."""
+
+    surveys: Path = Field(Path("data/surveys"), description="folder in which surveys arrive")
+    products: Path = Field(Path("data/products"), description="folder of the products")
+    settle: float = Field(
+        300, ge=0, le=1_000_000, description="seconds for which the files of a survey must have stayed as they are"
+    )
+    cron: str = Field("0 2 * * *", description="when make nightly runs: minute, hour, day, month, weekday")
+    timezone: str = Field("UTC", description="time zone of that, as Europe/Rome")
+    _given: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    def of_survey(self, name: str, cloud: Path, own: Path | None) -> SurveyConfig:
+        """What holds for a survey, whose ``own`` file may state otherwise.
+
+        Raises
+        ------
+        ConfigError
+            As :func:`load_survey`.
+        """
+        common = {key: value for key, value in self._given.items() if key in _Surveys.model_fields}
+        stated = _read_yaml(own) if own else {}
+        if not isinstance(stated, dict):
+            raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
+        if stated.get("parcels") and isinstance(overrides := common.get("overrides"), dict):
+            common["overrides"] = {name: overrides[name] for name in overrides if name in stated["parcels"]}
+        given: dict[str, Any] = {"survey": name, "cloud": cloud}
+        return _validated(SurveyConfig, merge(merge(common, stated), given), own or cloud)
+
+
+def merge(common: Any, own: Any) -> Any:
+    """Options with others laid over them, key by key."""
+    if isinstance(common, dict) and isinstance(own, dict):
+        return common | {key: merge(common.get(key), value) for key, value in own.items()}
+    return common if own is None else own
+
+
 def choose_parcel(config: SurveyConfig, name: str) -> str:
-    """Return the parcel's name as configured.
+    """Return the parcel's name if the configuration knows it, or leaves the parcels' names to the boundaries.
 
     Raises
     ------
     ConfigError
-        If the configuration doesn't know it; names the nearest that it does.
+        If it doesn't; names the nearest that it does.
     """
-    check_name(name)
-    if name in config.parcels:
+    name = check_name(name)
+    if config.parcels is None or name in config.parcels:
         return name
     raise ConfigError(f"survey {config.survey} has no parcel {name!r}: {_nearest(name, config.parcels)}")
 
@@ -252,6 +203,19 @@ def _nearest(word: str, known: list[str]) -> str:
 def load_survey(path: Path) -> SurveyConfig:
     """Read a survey's YAML file; ConfigError names the key, its value and what it may be."""
     return _validated(SurveyConfig, _read_yaml(path), path)
+
+
+def survey_config(**options: Any) -> SurveyConfig:
+    """Configuration of a survey without a file; ConfigError as of :func:`load_survey`."""
+    return _validated(SurveyConfig, {key: value for key, value in options.items() if value is not None}, None)
+
+
+def load_estate(path: Path) -> EstateConfig:
+    """Read an estate's YAML file; ConfigError names the key, its value and what it may be."""
+    data = _read_yaml(path)
+    config = _validated(EstateConfig, data, path)
+    config._given.update(data)  # noqa: SLF001
+    return config
 
 
 def load_settings(path: Path) -> Settings:
@@ -268,23 +232,50 @@ def load_settings(path: Path) -> Settings:
     )
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML in which a date is a word and no key stands twice."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012
+        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if twice := sorted({key for key in keys if keys.count(key) > 1}):
+            raise yaml.constructor.ConstructorError(
+                problem=f"{', '.join(twice)} stands there twice", problem_mark=node.start_mark
+            )
+        return super().construct_mapping(node, deep)
+
+
 def _read_yaml(path: Path) -> Any:
     if not path.is_file():
         folder = path.parent if path.parent.is_dir() else Path()
         known = [str(p) for p in sorted(folder.glob("*.yaml"))]
         raise ConfigError(f"{path}: no such file" + (f": {_nearest(str(path), known)}" if known else ""))
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - a SafeLoader
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: no valid YAML ({reason})") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: can't be read ({error.strerror})") from error
+    return {} if data is None else data
 
 
-def _validated(model: type[M], data: Any, path: Path) -> M:
+def _validated(model: type[M], data: Any, path: Path | None) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {'; '.join(_explain(e, model) for e in error.errors())}") from error
+        # A parcel that inherits what is wrong for all needn't say so once more.
+        reasons = dict.fromkeys(_explain(e, model) for e in _own(error.errors()))
+        raise ConfigError(f"{path or 'survey'}: {'; '.join(reasons)}") from error
+
+
+def _own(errors: list[ErrorDetails]) -> list[ErrorDetails]:
+    common = {(error["loc"], str(error["input"])) for error in errors}
+    return [e for e in errors if e["loc"][:1] != ("overrides",) or (e["loc"][2:], str(e["input"])) not in common]
 
 
 def _explain(error: ErrorDetails, model: type[Options]) -> str:
@@ -295,7 +286,9 @@ def _explain(error: ErrorDetails, model: type[Options]) -> str:
     if error["type"] == "missing":
         return f"{place} is missing"
     message = error["msg"].removeprefix("Value error, ")
-    return f"{place} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+    value = repr(error["input"])
+    hint = f": put it in quotes, '{error['input']}'" if error["type"] == "string_type" else ""
+    return f"{place} = {value if len(value) < 80 else value[:80] + '…'}: {message[0].lower()}{message[1:]}{hint}"
 
 
 def _model_at(model: type[Options], loc: tuple[int | str, ...]) -> type[Options]:

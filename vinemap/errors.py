@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+
+PASSING = {errno.EBUSY, errno.EAGAIN, errno.EINTR, errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOLCK}
+"""What the system says of a disk that may do the same a little later."""
+
 
 class VinemapError(Exception):
     """Root of every error that vinemap raises on purpose."""
+
+    heals = False
+    """Whether the same may go well a few minutes later."""
 
 
 class InputError(VinemapError):
@@ -21,3 +29,13 @@ class OutputError(VinemapError):
 
 class DependencyError(VinemapError):
     """A library that this step needs can't be loaded on this machine."""
+
+
+class BusyError(VinemapError):
+    """Something is in use, or is changing, just now."""
+
+    heals = True
+
+
+class WorkerError(VinemapError):
+    """A process died of its work, or would have taken more than it may."""

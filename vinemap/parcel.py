@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shutil
 import time
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from vinemap import __version__, paths
+from vinemap import __version__, machine, paths, store
 from vinemap.blocks import group_blocks
 from vinemap.canopy import NO_CANOPY, find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
 from vinemap.cgon import enclose, grow, peel_sections
@@ -23,7 +22,7 @@ from vinemap.cloud import join
 from vinemap.clustering import cluster_rows
 from vinemap.compiled import in_threads
 from vinemap.confidence import judge_rows
-from vinemap.config import Settings, check_name
+from vinemap.config import check_name
 from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
@@ -32,16 +31,17 @@ from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
 from vinemap.missing import count_missing
+from vinemap.notices import notices
 from vinemap.pdal_engine import check_engine, pdal_versions, read_cloud_pdal
 from vinemap.pieces import read_piece
-from vinemap.product import fingerprint, labelled, parcel_layer, write_product
+from vinemap.product import labelled, parcel_layer, write_product
+from vinemap.recipe import Recipe, recipe_of
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.section_table import Measures, measure_sections, summarise_rows, tabulate_sections
 from vinemap.sections import cut_sections
 from vinemap.tiles import Collector
-from vinemap.vector import read_boundary
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from vinemap.cloud import Sections
     from vinemap.pieces import Piece
     from vinemap.raster import Raster, RowField
+    from vinemap.settings import Settings
     from vinemap.tiles import Cloud
 
 T = TypeVar("T")
@@ -90,11 +91,17 @@ class Summary(NamedTuple):
     rows: int
     length: float
     seconds: float
+    warnings: tuple[str, ...] = ()
 
     def line(self) -> str:
         """The same as a sentence."""
-        found = f"{self.rows} rows, {self.length:,.0f} m" if self.rows else "no vine row found"
-        return f"{self.parcel}: {found}, in {self.seconds:.1f} s → {self.folder}"
+        remarks = "".join(f"; {warning}" for warning in self.warnings)
+        return f"{self.parcel}: {found(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
+
+
+def found(rows: int, length: float) -> str:
+    """In words, so many rows of so many metres in all."""
+    return f"{rows} rows, {length:,.0f} m" if rows else "no vine row found"
 
 
 def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
@@ -152,10 +159,6 @@ def map_parcel(
     boundary: Path | None = None,
     crs: CRS | None = None,
     origin: Origin | None = None,
-    piece: Piece | None = None,
-    inputs: Sequence[dict[str, Any]] = (),
-    drafts: Path | None = None,
-    share: float = 1.0,
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Map the rows and canopies of one parcel, and leave the product in a folder.
@@ -178,14 +181,6 @@ def map_parcel(
         CRS of the cloud's coordinates, where the file states none or a wrong one.
     origin : Origin, optional
         Origin of {Main}; by default the south-western corner of the parcel at its lowest terrain.
-    piece : Piece, optional
-        The parcel's points, where the cloud was read before.
-    inputs : sequence of dict, optional
-        Fingerprints of cloud and boundary, where they are known.
-    drafts : Path, optional
-        Folder on the product's disk where it is made, if not beside it.
-    share : float
-        Share of the memory that is this run's, where others run beside it.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -194,8 +189,44 @@ def map_parcel(
     VinemapError
         If the input can't be used or the product can't be written.
     """
-    parcel = check_name(parcel)
-    settings = settings or Settings()
+    name = check_name(parcel)
+    recipe = recipe_of(cloud, parcel=name, named=named, boundary=boundary, settings=settings, crs=crs, origin=origin)
+    return follow(recipe, folder, step=step)
+
+
+def follow(
+    recipe: Recipe,
+    folder: Path,
+    *,
+    piece: Piece | None = None,
+    drafts: Path | None = None,
+    within: Path | None = None,
+    share: float = 1.0,
+    step: Callable[..., Any] = call,
+) -> Summary:
+    """Make a product by its recipe.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        What it is made of.
+    folder : Path
+        Where the product goes, whole or not at all.
+    piece : Piece, optional
+        The parcel's points, where the cloud was read before.
+    drafts, within : Path, optional
+        As for :func:`vinemap.store.product`.
+    share : float
+        Share of the memory that is this run's, where others run beside it.
+    step : callable
+        As for :func:`map_parcel`.
+
+    Raises
+    ------
+    VinemapError
+        If the input can't be used or the product can't be written.
+    """
+    parcel, cloud, settings, origin = recipe.parcel, recipe.cloud, recipe.settings, recipe.origin
     with_pdal = settings.ground.engine == "pdal"
     check_engine(settings.ground.engine)
     began = time.perf_counter()
@@ -207,29 +238,30 @@ def map_parcel(
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
-    polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
-    inputs = list(inputs) or [fingerprint(path) for path in (cloud, boundary) if path]
-    with paths.product(folder, drafts) as draft:
+    with store.product(folder, drafts=drafts, within=within) as draft:
         collector = Collector(
             paths.tiles(draft),
             most=settings.reading.max_points or int(share * _most_points()),
             block=block_side(settings.ground.resolution),
         )
         points: Cloud
-        if with_pdal:
-            points = run("Reading", read_cloud_pdal, cloud, crs=crs, boundary=polygon)
-        elif piece:
+        if piece:
             points = run("Reading", read_piece, piece, collector)
         else:
-            points = run("Reading", read_cloud, cloud, crs=crs, boundary=polygon, collector=collector)
+            how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
+            if with_pdal:
+                points = run("Reading", read_cloud_pdal, cloud, **how)
+            else:
+                points = run("Reading", read_cloud, cloud, collector=collector, **how)
+            recipe.sources[0].check()
         if origin and np.abs(to_main(points.extent[0][None], points.crs, origin)[0, :2]).max() > FARTHEST:
             raise InputError(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
             )
-        found = map_rows(points, settings, step=run)
-        rows, gaps = found.rows, found.gaps
-        model = model_canopies(found, settings, step=run)
-        origin = origin or _corner(found.dtm)
+        seen = map_rows(points, settings, step=run)
+        rows, gaps = seen.rows, seen.gaps
+        model = model_canopies(seen, settings, step=run)
+        origin = origin or _corner(seen.dtm)
         rows, ends, enhanced = describe_rows(
             summarise_rows(rows, model.table, step=settings.sections.step),
             parcel=parcel,
@@ -243,40 +275,44 @@ def map_parcel(
             "key_points": enhanced,
             "sections": labelled(model.table, rows),
             "gaps": labelled(gaps, rows),
-            "parcel": parcel_layer(parcel, rows, polygon, points),
+            "parcel": parcel_layer(parcel, rows, recipe.boundary, points),
         }
 
         def write() -> None:
             plain = settings.product.plain
-            write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, plain=plain)
+            write_product(draft, parcel, layers, (seen.dtm, seen.chm), seen.field, meshes, points, plain=plain)
             if settings.product.classified:
-                classify = partial(classify_points, leaves=_leaves(found, settings))
-                write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
+                classify = partial(classify_points, leaves=_leaves(seen, settings))
+                write_classified(seen.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        counts = {"points": points.size, "key_points_found": found.n_key_points}
+        counts = {"points": points.size, "key_points_found": seen.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+        warnings = notices(rows, seen.chm, layers["parcel"], points.size)
         record = {
             "vinemap": __version__,
+            "key": recipe.key,
             "parcel": parcel,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "inputs": inputs,
+            "inputs": [source.record() for source in recipe.sources],
             "settings": settings.model_dump(mode="json"),
             "crs": points.crs.to_string(),
             "vertical_datum": points.vertical,
             "origin": origin._asdict(),
             "counts": counts,
             "modelling": modelling.to_dict() if len(model.table) else None,
+            "warnings": warnings,
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
             "versions": {"python": platform.python_version()}
             | {name: version(name) for name in LIBRARIES}
             | (pdal_versions() if with_pdal else {}),
-            "files": sorted(path.name for path in draft.iterdir()),
+            "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    return Summary(parcel, folder, len(rows), float(rows["length_m"].sum()), time.perf_counter() - began)
+    length = float(rows["length_m"].sum())
+    return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(warnings))
 
 
 class CanopyModel(NamedTuple):
@@ -352,11 +388,7 @@ def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
 
 def _most_points() -> int:
     """Points that half of the memory holds."""
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError):  # not on Windows
-        memory = 8 << 30
-    return int(memory / 2 / BYTES_A_POINT)
+    return machine.memory() // 2 // BYTES_A_POINT
 
 
 def _corner(dtm: Raster) -> Origin:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap.errors import InputError, OutputError
 from vinemap.las import boundary_in, collected, open_cloud
 from vinemap.zones import deal, zones_of
 
@@ -31,7 +32,9 @@ class Piece(NamedTuple):
     vertical: str | None
 
 
-def split_cloud(cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None) -> list[Piece]:
+def split_cloud(
+    cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None
+) -> list[Piece | InputError]:
     """Read a LAS, LAZ or COPC file once, and give every polygon its points; in several polygons' they go to each.
 
     Parameters
@@ -45,23 +48,42 @@ def split_cloud(cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, cr
     crs : CRS, optional
         CRS of the file's coordinates, where it states none or a wrong one.
 
+    Returns
+    -------
+    list
+        A piece for each polygon, or why it can't be brought to the cloud.
+
     Raises
     ------
     InputError
         If the file can't be read, as in :func:`vinemap.las.read_cloud`.
-    OSError
+    OutputError
         If the folder is full.
     """
     with open_cloud(cloud, crs=crs) as (target, vertical, chunks):
-        zones = zones_of([boundary_in(boundary, target, cloud) for boundary in boundaries])
-        pieces = [Piece(folder / f"{k}.xyz", cloud, target, vertical) for k in range(len(boundaries))]
-        for piece in pieces:
-            piece.path.touch()
-        for chunk in chunks:
-            xyz, start = deal(chunk, zones)
-            for k in np.flatnonzero(np.diff(start)):
-                with pieces[k].path.open("ab") as stream:
-                    stream.write(xyz[start[k] : start[k + 1]].data)
+        pieces: list[Piece | InputError] = []
+        polygons, paths = [], []
+        for number, boundary in enumerate(boundaries):
+            try:
+                polygons.append(boundary_in(boundary, target, cloud))
+            except InputError as error:
+                pieces.append(error)
+            else:
+                paths.append(folder / f"{number}.xyz")
+                pieces.append(Piece(paths[-1], cloud, target, vertical))
+        if not polygons:
+            return pieces
+        zones = zones_of(polygons)
+        try:
+            for path in paths:
+                path.touch()
+            for chunk in chunks:
+                xyz, start = deal(chunk, zones)
+                for k in np.flatnonzero(np.diff(start)):
+                    with paths[k].open("ab") as stream:
+                        stream.write(xyz[start[k] : start[k + 1]].data)
+        except OSError as error:
+            raise OutputError(f"{folder.parent}: can't be written ({error.strerror}): make room there") from error
     return pieces
 
 

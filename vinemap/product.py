@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import TYPE_CHECKING, Any
 
 import geopandas as gpd
@@ -13,7 +12,6 @@ from vinemap import paths
 from vinemap.blocks import outline_blocks
 from vinemap.compiled import in_threads
 from vinemap.crs import project
-from vinemap.errors import InputError
 from vinemap.mesh import Mesh, write_glb
 from vinemap.raster import Raster, RowField, write_cog
 from vinemap.vector import write_geopackage
@@ -120,21 +118,3 @@ def write_product(
         write_geopackage(layers, paths.geopackage(folder, parcel))
 
     in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes])
-
-
-def fingerprint(path: Path) -> dict[str, Any]:
-    """Name, size and SHA-256 of an input.
-
-    Raises
-    ------
-    InputError
-        If it can't be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror})") from error
-    return {"file": path.name, "bytes": path.stat().st_size, "sha256": digest}

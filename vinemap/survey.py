@@ -2,80 +2,165 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import TimeoutError as OutOfTime
-from concurrent.futures import as_completed
-from contextlib import contextmanager
+import contextvars
+import json
+import time
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from pebble import ProcessExpired, ProcessPool
-
-from vinemap import compiled, paths
-from vinemap.config import Settings
-from vinemap.errors import InputError, OutputError, VinemapError
-from vinemap.parcel import Summary, map_parcel
+from vinemap import __version__, machine, paths
+from vinemap.config import check_name
+from vinemap.crs import parse_crs
+from vinemap.errors import ConfigError, InputError, VinemapError, WorkerError
+from vinemap.parcel import Summary, call, follow, found
 from vinemap.pieces import split_cloud
-from vinemap.product import fingerprint
-from vinemap.vector import read_boundary
+from vinemap.recipe import Recipe, Source, earlier_record, read_source
+from vinemap.store import workshop
+from vinemap.vector import read_parcels
+from vinemap.workers import Worker, Workers
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from concurrent.futures import Future
-    from pathlib import Path
+    from contextlib import AbstractContextManager
 
-    from pyproj import CRS
-
-    from vinemap.crs import Origin
+    from vinemap.config import SurveyConfig
     from vinemap.las import Boundary
     from vinemap.pieces import Piece
 
+DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
+"""What can become of a parcel."""
+MOST_MEMORY = 0.8
+"""Share of the memory that a job takes."""
 
-class Outcome(NamedTuple):
-    """What came of a parcel: what was found, or why nothing was."""
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a parcel."""
 
     parcel: str
-    summary: Summary | None
+    state: str
+    rows: int = 0
+    length: float = 0.0
+    """Of all rows (m)."""
+    seconds: float = 0.0
     reason: str = ""
+    """Why it failed, or what is to be known of it."""
+    heals: bool = False
+    """Whether it may go well another time, with the same input."""
+    key: str = ""
+    """Of the recipe."""
 
     def line(self) -> str:
         """The same as a sentence."""
-        return self.summary.line() if self.summary else f"{self.parcel}: failed: {' '.join(self.reason.split())}"
+        what = f"{found(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
+        colon = "; " if self.state == DONE else ": "
+        return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
 
 
-def map_survey(
-    cloud: Path,
-    folder: Path,
-    *,
-    parcels: Sequence[str],
-    boundaries: Path,
-    settings: Settings | None = None,
-    crs: CRS | None = None,
-    origin: Origin | None = None,
-    workers: int | None = None,
-    limit: float | None = None,
-) -> Iterator[Outcome]:
-    """Map parcels of a cloud, and leave the product of each in a folder of its name.
+class Plan(NamedTuple):
+    """What is to be done for a survey, and what is settled without."""
 
-    The cloud is read once and every point goes to the parcels that hold it. Each parcel is then worked by a process of
-    its own: what goes wrong there, a crash or too long a time even, is that parcel's alone.
+    sources: tuple[Source, ...]
+    recipes: list[Recipe]
+    settled: list[Outcome]
+    listed: bool
+    """Whether somebody has named the parcels, so that each must be in the cloud."""
+
+
+class Engine(Protocol):
+    """Takes calls from as many threads as it has slots, as :class:`vinemap.workers.Workers` does."""
+
+    slots: int
+
+    def run(self, function: Callable[..., Any], *args: Any, limit: float | None, **kwargs: Any) -> Any:
+        """Run a function, or raise a VinemapError."""
+
+    def stop(self) -> None:
+        """Break off what runs."""
+
+
+def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> Plan:
+    """Find out which parcels of a survey need to be mapped: those whose recipe is another than their product's.
 
     Parameters
     ----------
-    cloud : Path
-        LAS, LAZ or COPC file.
+    config : SurveyConfig
+        The survey.
+    folder : Path
+        Folder of its products' folders.
+    again : bool
+        Whether to map them all.
+
+    Raises
+    ------
+    InputError
+        If the cloud or the boundaries can't be read.
+    """
+    cloud = config.cloud or paths.survey_cloud(config.survey)
+    boundaries = config.boundaries or paths.survey_boundaries(config.survey)
+    earlier = _earlier(folder)
+    known = [Source(Path(s["path"]), s["sha256"], tuple(s["stamp"]), s["read"]) for s in earlier.get("sources", [])]
+    polygons: dict[str, Boundary | InputError | None]
+    sources: tuple[Source, ...]
+    if config.boundaries is None and config.parcels is None and not boundaries.exists():
+        sources, polygons = (read_source(cloud, known),), {config.survey: None}
+    else:
+        sources = read_source(cloud, known), read_source(boundaries, known)
+        polygons = {**read_parcels(boundaries, config.parcels)}
+    failures = {} if again else {one["parcel"]: one for one in earlier.get("parcels", []) if not one["heals"]}
+    crs = parse_crs(config.crs) if config.crs else None
+    plan = Plan(sources, [], [], config.parcels is not None)
+    for name, polygon in polygons.items():
+        try:
+            parcel = check_name(name)
+        except ConfigError as error:
+            plan.settled.append(Outcome(name, FAILED, reason=str(error)))
+            continue
+        if isinstance(polygon, InputError):
+            plan.settled.append(Outcome(parcel, FAILED, reason=str(polygon)))
+            continue
+        own = config.of_parcel(parcel)
+        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin)
+        key = recipe.key
+        record = None if again else earlier_record(folder / parcel)
+        if record and (record["key"], record["parcel"]) == (key, parcel):
+            plan.settled.append(Outcome(parcel, CURRENT, rows=record["counts"].get("rows", 0), key=key))
+        elif failures.get(parcel, {}).get("key") == key:
+            plan.settled.append(Outcome(**failures[parcel]))
+        else:
+            plan.recipes.append(recipe)
+    return plan
+
+
+def map_survey(
+    config: SurveyConfig,
+    folder: Path,
+    *,
+    again: bool = False,
+    step: Callable[..., Any] = call,
+) -> Iterator[Outcome]:
+    """Map the parcels of a survey that need it, and leave the product of each in a folder of its name.
+
+    The cloud is read once and every point goes to the parcels that hold it. Each parcel is then worked by a process of
+    its own: what goes wrong there, a crash or too long a time even, is that parcel's alone. ``survey.json`` in the
+    folder tells at the end what became of each.
+
+    Parameters
+    ----------
+    config : SurveyConfig
+        The survey.
     folder : Path
         Folder of the products' folders.
-    parcels : sequence of str
-        Names of parcels.
-    boundaries : Path
-        File with the parcels' polygons.
-    settings, crs, origin
-        As for :func:`vinemap.parcel.map_parcel`.
-    workers : int, optional
-        Parcels that are worked at once; as many as there are cores by default.
-    limit : float, optional
-        Seconds that a parcel may take.
+    again : bool
+        Whether to map parcels that are up to date as well, and those known to fail.
+    step : callable
+        Runs the work on a parcel, as ``step(parcel, function, *args, **kwargs)``, in a thread.
 
     Yields
     ------
@@ -87,88 +172,157 @@ def map_survey(
     VinemapError
         If the cloud or the boundaries can't be read at all, or nothing can be written.
     """
-    settings = settings or Settings()
-    polygons: dict[str, Boundary] = {}
-    for parcel in parcels:
+    began = datetime.now(UTC)
+    with workshop(folder) as aside:
+        plan = plan_survey(config, folder, again=again)
+        outcomes: list[Outcome] = []
         try:
-            polygons[parcel] = read_boundary(boundaries, parcel=parcel)
+            yield from _noted(plan.settled, outcomes)
+            if plan.recipes:
+                yield from _noted(_work(plan, config, folder, aside, step), outcomes)
         except InputError as error:
-            yield Outcome(parcel, None, str(error))
-    if not polygons:
-        return
-    inputs = [fingerprint(cloud), fingerprint(boundaries)]
-    n = min(workers or compiled.CORES, len(polygons))
-    work = partial(
-        _work, cloud, boundary=boundaries, settings=settings, crs=crs, origin=origin, inputs=inputs, share=1 / n
-    )
-    try:
-        # What a process leaves that is killed lies aside as well.
-        with paths.aside(folder) as aside, _processes(n) as pool:
-            pool.submit(int, None)  # nothing: processes start while the cloud is read
-            pieces = _pieces(cloud, polygons, aside, crs=crs, settings=settings)
-            largest_first = sorted(zip(polygons, pieces, strict=True), key=lambda job: -_size(job[1]))
-            jobs: dict[Future[Summary], str] = {
-                pool.submit(work, limit, folder / parcel, parcel, piece, aside): parcel
-                for parcel, piece in largest_first
-            }
-            for job in as_completed(jobs):
-                yield _outcome(jobs[job], job, limit)
-    except OSError as error:
-        raise OutputError(f"{folder}: can't be written ({error.strerror or error}): choose another folder") from error
+            done = {outcome.parcel for outcome in outcomes}
+            left = [recipe for recipe in plan.recipes if recipe.parcel not in done]
+            outcomes += [Outcome(r.parcel, FAILED, reason=str(error), key=r.key) for r in left]
+            raise
+        finally:
+            _write_record(config, folder, plan, outcomes, began)
 
 
-@contextmanager
-def _processes(n: int) -> Iterator[ProcessPool]:
-    """Processes that are stopped at once if their work is broken off."""
-    with ProcessPool(
-        n,
-        context=multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=(max(1, compiled.CORES // n),),
-    ) as pool:
+def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
+    for outcome in outcomes:
+        into.append(outcome)
+        yield outcome
+
+
+def _engine(plan: Plan, config: SurveyConfig) -> AbstractContextManager[Engine]:
+    """What runs the parcels."""
+    job = config.job
+    if job.engine == "dask":
+        from vinemap.dask_engine import DaskWorkers
+
+        return DaskWorkers(job.scheduler or "", memory=job.memory)
+    n = min(job.workers or machine.cores(), len(plan.recipes))
+    return Workers(n, cores=max(1, machine.cores() // n), memory=_memory(config, n))
+
+
+def _memory(config: SurveyConfig, n: int) -> int:
+    """Bytes that each of n processes may take."""
+    return int(config.job.memory * 1e9) if config.job.memory else int(MOST_MEMORY * machine.memory() / n)
+
+
+def _work(
+    plan: Plan,
+    config: SurveyConfig,
+    folder: Path,
+    aside: Path,
+    step: Callable[..., Any],
+) -> Iterator[Outcome]:
+    with _engine(plan, config) as workers, ThreadPoolExecutor(workers.slots) as threads:
         try:
-            yield pool
+            jobs = _jobs(plan, config, aside)
+            # Two for each slot, so that it need not wait until this is asked for the next outcome.
+            waiting: set[Future[Outcome]] = set()
+            while True:
+                for recipe, piece in islice(jobs, 2 * workers.slots - len(waiting)):
+                    if isinstance(piece, Outcome):
+                        yield piece
+                        continue
+                    run = partial(_run, recipe, piece, folder, aside, config.job.limit, workers, step)
+                    waiting.add(threads.submit(contextvars.copy_context().run, run))
+                if not waiting:
+                    break
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for job in done:
+                    yield job.result()
         except BaseException:
-            pool.stop()  # type: ignore[no-untyped-call]
+            threads.shutdown(wait=False, cancel_futures=True)
+            workers.stop()
             raise
 
 
-def _pieces(
-    cloud: Path, polygons: dict[str, Boundary], folder: Path, *, crs: CRS | None, settings: Settings
-) -> list[Piece] | list[None]:
-    """The points of each parcel; None where it reads them itself: of a COPC's one parcel, or with PDAL."""
-    if len(polygons) == 1 or settings.ground.engine == "pdal":
-        return [None] * len(polygons)
-    return split_cloud(cloud, list(polygons.values()), folder, crs=crs)
-
-
-def _size(piece: Piece | None) -> int:
-    return piece.path.stat().st_size if piece else 0
-
-
-def _begin(cores: int) -> None:
-    """Make a process ready for work on so many cores."""
-    compiled.use_cores(cores)
-
-
-def _work(cloud: Path, folder: Path, parcel: str, piece: Piece | None, drafts: Path, **options: Any) -> Summary:
+def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recipe, Piece | Outcome | None]]:
+    """Recipes with their points, the largest first; with none where a parcel reads them itself, of a COPC's, say."""
+    together = [r for r in plan.recipes if r.boundary and r.settings.ground.engine != "pdal"]
+    if len(together) < 2:
+        together = []
+    for recipe in plan.recipes:
+        if recipe not in together:
+            yield recipe, None
+    if not together:
+        return
+    cloud, limit = together[0].cloud, config.job.limit * len(together)
+    reader = Worker(cores=machine.cores(), memory=_memory(config, 1))
     try:
-        return map_parcel(cloud, folder, parcel=parcel, piece=piece, drafts=drafts, **options)
+        boundaries = [recipe.boundary for recipe in together]
+        pieces = reader.run(split_cloud, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
+    except WorkerError as error:
+        raise WorkerError(f"{cloud}: can't be read: {error}") from error
+    finally:
+        reader.close()
+    plan.sources[0].check()
+    sizes = [0 if isinstance(piece, InputError) else piece.path.stat().st_size for piece in pieces]
+    for k in sorted(range(len(pieces)), key=lambda k: -sizes[k]):
+        recipe, piece = together[k], pieces[k]
+        if isinstance(piece, InputError):
+            yield recipe, Outcome(recipe.parcel, FAILED, reason=str(piece), key=recipe.key)
+        elif sizes[k] == 0 and not plan.listed:
+            yield recipe, Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
+        else:
+            yield recipe, piece
+
+
+def _run(
+    recipe: Recipe,
+    piece: Piece | None,
+    folder: Path,
+    aside: Path,
+    limit: float,
+    workers: Engine,
+    step: Callable[..., Any],
+) -> Outcome:
+    """Have a parcel worked, and tell what became of it."""
+    began = time.perf_counter()
+    failed = partial(Outcome, recipe.parcel, FAILED, key=recipe.key)
+    options = {"piece": piece, "drafts": aside, "within": folder, "share": 1 / workers.slots, "limit": limit}
+    try:
+        summary: Summary = step(recipe.parcel, workers.run, follow, recipe, folder / recipe.parcel, **options)
+    except VinemapError as error:
+        known = isinstance(error, (InputError, ConfigError))
+        return failed(seconds=time.perf_counter() - began, reason=str(error), heals=not known)
+    except Exception as error:  # noqa: BLE001 - a fault of our own costs no other parcel
+        return failed(reason=f"a fault of vinemap's own ({type(error).__name__}: {error})", heals=True)
     finally:
         if piece:
             piece.path.unlink(missing_ok=True)
+    numbers = summary.rows, round(summary.length, 3), round(summary.seconds, 3)
+    return Outcome(recipe.parcel, DONE, *numbers, reason="; ".join(summary.warnings), key=recipe.key)
 
 
-def _outcome(parcel: str, job: Future[Summary], limit: float | None) -> Outcome:
+def _earlier(folder: Path) -> dict[str, Any]:
+    """What the last job in a folder has left, if it can be read."""
     try:
-        return Outcome(parcel, job.result())
-    except VinemapError as error:
-        return Outcome(parcel, None, str(error))
-    except OutOfTime:
-        return Outcome(parcel, None, f"took longer than {limit:g} s")
-    except ProcessExpired as error:
-        return Outcome(parcel, None, f"its process died (code {error.exitcode})")
-    except MemoryError:
-        return Outcome(parcel, None, "not enough memory")
-    except Exception as error:  # noqa: BLE001 - a fault of our own costs no other parcel
-        return Outcome(parcel, None, f"a fault of vinemap's own ({type(error).__name__}: {error})")
+        record: dict[str, Any] = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
+        [Outcome(**one) for one in record["parcels"]]
+        [(s["path"], s["sha256"], tuple(s["stamp"]), s["read"]) for s in record["sources"]]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    return record
+
+
+def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list[Outcome], began: datetime) -> None:
+    parcels = {outcome.parcel: asdict(outcome) for outcome in outcomes}
+    if plan.listed:  # what is known of others holds on
+        parcels = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])} | parcels
+    record = {
+        "vinemap": __version__,
+        "survey": config.survey,
+        "began": began.isoformat(timespec="seconds"),
+        "seconds": round((datetime.now(UTC) - began).total_seconds(), 3),
+        "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
+        "parcels": [parcels[name] for name in sorted(parcels)],
+    }
+    path = paths.survey_record(folder)
+    draft = path.with_name(f".{path.name}.part")
+    draft.write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
+    draft.replace(path)

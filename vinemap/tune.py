@@ -16,12 +16,12 @@ import shapely
 from scipy.optimize import differential_evolution
 
 from vinemap.cli import FILE, plain_errors
-from vinemap.config import PolygonOptions, SectionOptions, Settings
 from vinemap.crs import parse_crs
 from vinemap.errors import InputError
 from vinemap.las import read_cloud
 from vinemap.parcel import map_rows, model_canopies
 from vinemap.section_table import modelling_indices
+from vinemap.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.vector import read_boundary
 
 if TYPE_CHECKING:

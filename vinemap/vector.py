@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import unicodedata
 import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,7 +17,7 @@ from vinemap.errors import InputError, OutputError
 from vinemap.style import layer_styles
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -144,27 +145,76 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
         File whose only layer of polygons, or whose layer ``parcel``, is read.
     parcel : str, optional
         Name that one of the polygon's columns holds, where there are several; without a name all of them count. The
-        column is that of :func:`parcel_names`, or the next one that holds the name.
+        column is that of :func:`read_parcels`, or the next one that holds the name.
 
     Raises
     ------
     InputError
         If the file can't be read, has no polygon or no CRS, or none with the parcel's name.
     """
+    if parcel is None:
+        frame = _read_polygons(path)
+        return _polygon(frame.geometry, path), frame.crs
+    (found,) = read_parcels(path, [parcel]).values()
+    if isinstance(found, InputError):
+        raise found
+    return found
+
+
+def read_parcels(
+    path: Path, names: Sequence[str] | None = None
+) -> dict[str, tuple[shapely.Geometry, CRS] | InputError]:
+    """Read the polygons of parcels, or what is wrong with one.
+
+    Parameters
+    ----------
+    path : Path
+        As for :func:`read_boundary`.
+    names : sequence of str, optional
+        Names of parcels; by default those in the first column, a likely one before others, that tells all polygons
+        apart. A single polygon is the parcel's, whatever it is called.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, has no polygon or no CRS, or no column that has a name for each.
+    """
     frame = _read_polygons(path)
-    if parcel is not None and len(frame) > 1:
-        columns = frame.drop(columns="geometry").astype(str)
-        holding = [name for name in _name_columns(frame) if (columns[name] == parcel).any()]
-        if not holding:
-            words = sorted({word for name in columns for word in columns[name] if word not in ("None", "nan")})
-            close = difflib.get_close_matches(parcel, words, n=1, cutoff=0.5)
-            hint = f"did you mean {close[0]!r}?" if close else "check the name"
-            raise InputError(f"{path}: none of its {len(frame)} polygons has {parcel!r} in a column: {hint}")
-        frame = frame[columns[holding[0]] == parcel]
-    polygon = _areas(shapely.make_valid(shapely.union_all(shapely.make_valid(frame.geometry.to_numpy()))))
+    columns = {name: _words(frame[name]) for name in _name_columns(frame)}
+    if names is None:
+        first = next(iter(columns.values()), None)
+        if first is None or not _tells_apart(first):
+            raise InputError(
+                f"{path}: no column has a name of its own for each of its {len(frame)} polygons: add one, 'name'"
+            )
+        names = list(first)
+    places = [words.groupby(words).indices for words in columns.values()]
+    found: dict[str, tuple[shapely.Geometry, CRS] | InputError] = {}
+    for name in names:
+        word = unicodedata.normalize("NFC", name)
+        rows = next((place[word] for place in places if word in place), None) if len(frame) > 1 else [0]
+        try:
+            if rows is None:
+                raise _no_such(path, name, frame, columns.values())
+            found[name] = _polygon(frame.geometry.iloc[rows], path), frame.crs
+        except InputError as error:
+            found[name] = error
+    return found
+
+
+def _no_such(path: Path, name: str, frame: gpd.GeoDataFrame, columns: Iterable[pd.Series]) -> InputError:
+    words = sorted({str(word) for column in columns for word in column.dropna()})
+    close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
+    hint = f"did you mean {close[0]!r}?" if close else "check the name"
+    return InputError(f"{path}: none of its {len(frame)} polygons has {name!r} in a column: {hint}")
+
+
+def _polygon(shapes: gpd.GeoSeries, path: Path) -> shapely.Geometry:
+    """All of some shapes, valid and flat."""
+    polygon = _areas(shapely.make_valid(shapely.union_all(shapely.make_valid(shapes.to_numpy()))))
     if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
-    return shapely.force_2d(polygon), frame.crs
+    return shapely.force_2d(polygon)
 
 
 def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
@@ -174,30 +224,20 @@ def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
     return geometry if len(areas) == len(parts) else shapely.union_all(areas)
 
 
-def parcel_names(path: Path) -> list[str]:
-    """Names of all parcels in a file of polygons: the first column, a likely one before others, that tells them apart.
-
-    Raises
-    ------
-    InputError
-        If the file can't be read, has no polygon or no CRS, or no column that has a name for each.
-    """
-    frame = _read_polygons(path)
-    for name in _name_columns(frame)[:1]:
-        if _tells_apart(frame[name]):
-            return list(frame[name].astype(str))
-    raise InputError(f"{path}: no column has a name of its own for each of its {len(frame)} polygons: add one, 'name'")
-
-
 def _name_columns(frame: gpd.GeoDataFrame) -> list[str]:
     """Columns that may name polygons: such as have a name for each first, and of these, likely ones."""
     columns = [str(name) for name in frame.columns if name != "geometry"]
-    return sorted(columns, key=lambda name: (not _tells_apart(frame[name]), name.lower() not in NAME_COLUMNS))
+    return sorted(columns, key=lambda name: (not _tells_apart(_words(frame[name])), name.lower() not in NAME_COLUMNS))
 
 
-def _tells_apart(names: pd.Series) -> bool:
-    words = names.astype(str)
-    return bool(words.is_unique and not names.isna().any() and (words.str.strip() != "").all())
+def _words(column: pd.Series) -> pd.Series:
+    """Names as words, their Unicode composed, without those that are empty."""
+    words = column.dropna().astype(str).str.strip().str.normalize("NFC")
+    return words[words != ""].reindex(column.index)
+
+
+def _tells_apart(words: pd.Series) -> bool:
+    return bool(words.is_unique and words.notna().all())
 
 
 def _read_polygons(path: Path) -> gpd.GeoDataFrame:

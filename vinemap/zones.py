@@ -31,6 +31,7 @@ class Zones(NamedTuple):
     """Polygons, and a raster (ny, nx) that tells of its cells which polygon covers them."""
 
     polygons: Sequence[shapely.Geometry]
+    tree: shapely.STRtree
     grid: Grid
     code: Labels
 
@@ -56,7 +57,7 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
         here = code[where]
         here[inside] = np.where(here[inside] == NOWHERE, k, ASK)
         here[edge] = ASK
-    return Zones(polygons, grid, code)
+    return Zones(polygons, shapely.STRtree(polygons), grid, code)
 
 
 def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
@@ -73,19 +74,12 @@ def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
     _look_up(xyz, zones.grid, zones.code, label)
     asked = np.flatnonzero(label == ASK)
     label[asked] = NOWHERE
-    again, into = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int32)]
-    x, y = xyz[asked, 0], xyz[asked, 1]
-    for k, polygon in enumerate(zones.polygons if len(asked) else ()):
-        west, south, east, north = shapely.bounds(polygon)
-        near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
-        inside = asked[near[shapely.contains_xy(polygon, x[near], y[near])]]
-        taken = label[inside] != NOWHERE
-        label[inside[~taken]] = k
-        again.append(inside[taken])
-        into.append(np.full(np.count_nonzero(taken), k, dtype=np.int32))
-    shared, others = np.concatenate(again), np.concatenate(into)
-    order = np.argsort(shared, kind="stable")
-    return _gather(xyz, label, shared[order], others[order], len(zones.polygons))
+    p, k = zones.tree.query(shapely.points(xyz[asked, :2]), predicate="within")
+    order = np.lexsort((k, p))
+    p, k = asked[p[order]], k[order].astype(np.int32)
+    first = np.diff(p, prepend=-1) > 0
+    label[p[first]] = k[first]
+    return _gather(xyz, label, p[~first], k[~first], len(zones.polygons))
 
 
 @compiled

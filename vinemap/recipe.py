@@ -1,0 +1,157 @@
+"""What a product is made of, and whether an earlier one is made of the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import shapely
+
+from vinemap import __version__, paths
+from vinemap.errors import PASSING, BusyError, InputError
+from vinemap.settings import Settings
+from vinemap.vector import read_boundary
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from pyproj import CRS
+
+    from vinemap.crs import Origin
+    from vinemap.las import Boundary
+
+SETTLED = 2.0
+"""Seconds within which a file can change twice without its time telling."""
+
+
+class Source(NamedTuple):
+    """A file that was read, by its content."""
+
+    path: Path
+    sha256: str
+    stamp: tuple[int, ...]
+    """Bytes, times of change (ns) and inode, which stay while the file does."""
+    read: float
+    """When it was read, in seconds since 1970."""
+
+    def record(self) -> dict[str, Any]:
+        """Name, size and SHA-256."""
+        return {"file": self.path.name, "bytes": self.stamp[0], "sha256": self.sha256}
+
+    def check(self) -> None:
+        """Make sure that the file is still the same.
+
+        Raises
+        ------
+        BusyError
+            If it isn't.
+        """
+        if _stamp(self.path) != self.stamp:
+            raise BusyError(f"{self.path}: changed while it was read: try again when it stays as it is")
+
+
+def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
+    """Work out a file's SHA-256, unless it is known and the file has not been touched since.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read.
+    BusyError
+        If it changes meanwhile.
+    """
+    began, stamp = time.time(), _stamp(path)
+    for source in known:
+        if (source.path, source.stamp) == (path, stamp) and max(stamp[1:3]) < (source.read - SETTLED) * 1e9:
+            return source
+    try:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    source = Source(path, digest, stamp, began)
+    source.check()
+    return source
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
+
+
+def _unreadable(path: Path, error: OSError) -> InputError | BusyError:
+    if isinstance(error, FileNotFoundError):
+        return InputError(f"{path}: no such file")
+    kind = BusyError if error.errno in PASSING else InputError
+    return kind(f"{path}: can't be read ({error.strerror})")
+
+
+class Recipe(NamedTuple):
+    """All that the product of a parcel depends on."""
+
+    parcel: str
+    cloud: Path
+    sources: tuple[Source, ...]
+    """The cloud first."""
+    boundary: Boundary | None
+    settings: Settings
+    crs: CRS | None
+    """CRS of the cloud's coordinates, where it is given."""
+    origin: Origin | None
+    """Origin of {Main}, where it is given."""
+
+    @property
+    def key(self) -> str:
+        """Hash of what it depends on, this version of vinemap included."""
+        polygon = None
+        if self.boundary:
+            shape, crs = self.boundary
+            polygon = [shapely.to_wkb(shapely.normalize(shape), hex=True), crs.to_wkt()]
+        parts = {
+            "vinemap": __version__,
+            "parcel": self.parcel,
+            "cloud": self.sources[0].sha256,
+            "polygon": polygon,
+            "crs": self.crs.to_wkt() if self.crs else None,
+            "origin": self.origin,
+            "settings": self.settings.model_dump(mode="json"),
+        }
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def recipe_of(
+    cloud: Path,
+    *,
+    parcel: str,
+    named: bool = True,
+    boundary: Path | None = None,
+    settings: Settings | None = None,
+    crs: CRS | None = None,
+    origin: Origin | None = None,
+) -> Recipe:
+    """Gather what the product of one parcel depends on, as :func:`vinemap.parcel.map_parcel` is told.
+
+    Raises
+    ------
+    InputError
+        If the cloud or the boundary can't be read.
+    """
+    polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
+    sources = tuple(read_source(path) for path in (cloud, boundary) if path)
+    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin)
+
+
+def earlier_record(folder: Path) -> dict[str, Any] | None:
+    """What ``run.json`` tells of the product in a folder; None where there is none, or not all of its files."""
+    try:
+        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        whole = all((folder / name).stat().st_size == size for name, size in record["files"].items())
+        return record if whole and {"key", "parcel", "counts"} <= record.keys() else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None

@@ -1,0 +1,221 @@
+"""Folders of products: what comes into them comes whole, and what another run holds is left to it."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+import uuid
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from filelock import FileLock, Timeout
+
+from vinemap import paths
+from vinemap.errors import BusyError, OutputError, VinemapError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+"""Of Linux's renameat2(2)."""
+PART = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
+"""Name of a product in the making, or of an earlier one on its way out."""
+SIDE = re.compile(r"(-wal|-shm|-journal|\.aux\.xml|\.ovr|\.msk)$")
+"""What SQLite and GDAL add to the name of a file for one that they leave beside it."""
+PATIENCE = 10.0
+"""Seconds for which another run may keep a parcel, as one does that is being stopped."""
+
+
+@contextmanager
+def workshop(folder: Path) -> Iterator[Path]:
+    """Hold the folder of a survey's products against other jobs, and give a folder in it for what goes again.
+
+    What an earlier job has left that was killed goes first. The folder itself goes too if it was made for this and
+    stays empty.
+
+    Raises
+    ------
+    BusyError
+        If another job holds it.
+    OutputError
+        If nothing can be written there.
+    """
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _held(paths.lock(folder), f"{folder}: another job is at work here: wait until it is done"):
+            _sweep(folder)
+            try:
+                with tempfile.TemporaryDirectory(prefix=paths.PIECES, dir=folder, ignore_cleanup_errors=True) as inner:
+                    yield Path(inner).resolve()
+            finally:
+                _sweep(folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+    finally:
+        _remove_empty(made)
+
+
+@contextmanager
+def product(target: Path, *, drafts: Path | None = None, within: Path | None = None) -> Iterator[Path]:
+    """Give a folder to write a product into, and put it in place of ``target`` if all went well.
+
+    An earlier product is replaced whole, at one stroke where the system can do that (on Linux), and other files beside
+    it stay. In a folder that holds something else and isn't one of a survey's, the product's files replace those of
+    the same name. The folder is made beside the target, or among ``drafts``, on the same disk.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of the product.
+    drafts : Path, optional
+        Folder for it in the making, where somebody clears up even if this process dies.
+    within : Path, optional
+        Folder of the survey's products, which the target must not lead out of.
+
+    Raises
+    ------
+    OutputError
+        If nothing can be written there.
+    BusyError
+        If another run is at work there.
+    """
+    place = target.resolve()
+    if within and not place.is_relative_to(within.resolve()):
+        raise OutputError(f"{target}: is a link that leads out of {within}: put a folder in its place")
+    made = [folder for folder in place.parents if not folder.exists()]
+    draft = (drafts or place.parent) / f".{place.name}.{uuid.uuid4().hex[:8]}.part"
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with _held(paths.parcel_lock(place), f"{target}: another run is at work here", patience=PATIENCE):
+            if place.exists() and not place.is_dir():
+                raise NotADirectoryError(20, "is a file")
+            if not drafts:
+                _remove_parts(place)
+            draft.mkdir()
+            try:
+                yield draft
+                _publish(draft, place, replace=within is not None)
+            finally:
+                shutil.rmtree(draft, ignore_errors=True)
+    except OSError as error:
+        raise unwritable(target, error) from error
+    finally:
+        _remove_empty(made)
+
+
+def unwritable(place: Path, error: OSError) -> OutputError:
+    """What is said of a folder in which nothing can be written."""
+    return OutputError(f"{place}: can't be written ({error.strerror or error}): choose another folder")
+
+
+@contextmanager
+def _held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
+    """Hold a lock, which the system lets go of if this process dies; BusyError says the reason if another has it."""
+    holder = FileLock(lock)
+    try:
+        holder.acquire(timeout=patience)
+    except Timeout as error:
+        raise BusyError(reason) from error
+    try:
+        yield
+    finally:
+        # Who waits for it finds out that it is no longer the file of that name, and makes another.
+        with suppress(OSError):
+            lock.unlink()
+        holder.release()
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what runs have left that were killed."""
+    for path in folder.iterdir():
+        if path.name.startswith(paths.PIECES):
+            shutil.rmtree(path, ignore_errors=True)
+        elif part := PART.fullmatch(path.name):
+            with suppress(VinemapError), _held(paths.parcel_lock(folder / part[1]), "held"):
+                shutil.rmtree(path, ignore_errors=True)
+        elif path.name.startswith(".") and path.suffix == ".lock" and path != paths.lock(folder):
+            with suppress(VinemapError), _held(path, "held"):
+                pass
+
+
+def _remove_parts(place: Path) -> None:
+    for path in place.parent.iterdir():
+        if (part := PART.fullmatch(path.name)) and part[1] == place.name:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _publish(draft: Path, target: Path, *, replace: bool) -> None:
+    if not target.exists():
+        draft.rename(target)
+    elif replace or _is_earlier(target, draft):
+        _keep_others(target, draft)
+        _exchange(draft, target)
+    else:
+        paths.run_record(target).unlink(missing_ok=True)
+        for path in sorted(draft.iterdir(), key=lambda p: p.name == paths.RUN):
+            path.replace(target / path.name)
+
+
+def _is_earlier(target: Path, draft: Path) -> bool:
+    """Whether a folder is empty or holds an earlier product of the same parcel."""
+    new = _record(draft)
+    return not any(target.iterdir()) or bool(new and new.get("parcel") == _record(target).get("parcel"))
+
+
+def _record(folder: Path) -> dict[str, object]:
+    try:
+        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _keep_others(target: Path, draft: Path) -> None:
+    """Take a folder's files over that aren't of the product in it, nor made beside them by QGIS."""
+    files = _record(target).get("files")
+    ours = {*files, paths.RUN} if isinstance(files, (list, dict)) else {paths.RUN}
+    for path in target.iterdir():
+        kept = draft / path.name
+        if path.name in ours or SIDE.sub("", path.name) in ours or kept.exists():
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.copytree(path, kept, symlinks=True, copy_function=_link)
+        else:
+            _link(path, kept)
+
+
+def _link(path: str | Path, kept: str | Path) -> None:
+    try:
+        os.link(path, kept, follow_symlinks=False)
+    except OSError:
+        shutil.copy2(path, kept, follow_symlinks=False)
+
+
+def _exchange(draft: Path, target: Path) -> None:
+    """Put a folder in another's place, and the other in its."""
+    if sys.platform == "linux":
+        with suppress(AttributeError):  # a C library without it
+            names = os.fsencode(draft), os.fsencode(target)
+            if ctypes.CDLL(None).renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE) == 0:
+                return
+    old = draft.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    target.rename(old)
+    try:
+        draft.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    old.rename(draft)
