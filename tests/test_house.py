@@ -47,6 +47,7 @@ MAY_IMPORT = {
     "scenes": BASE | {"synthetic"},
     **dict.fromkeys(SETTINGS, BASE),
     "product": CHAIN,
+    "stac": CHAIN,
     "parcel": CHAIN | {"product"},
     "survey": CHAIN | {"parcel", "product"},
     "canopy_accuracy": CHAIN | {"parcel"},

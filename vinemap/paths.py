@@ -77,6 +77,16 @@ def run_record(folder: Path) -> Path:
     return folder / RUN
 
 
+def stac_item(folder: Path, name: str) -> Path:
+    """STAC item of a parcel in its product's folder, or of a survey in that of its products."""
+    return folder / f"{name}_stac.json"
+
+
+def stac_collection(folder: Path) -> Path:
+    """STAC collection of a survey's products."""
+    return folder / "collection.json"
+
+
 @contextmanager
 def aside(folder: Path) -> Iterator[Path]:
     """Give a folder in another, for what goes again; so does the other if it has been made for it and stays empty.
