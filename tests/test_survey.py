@@ -25,6 +25,8 @@ from vinemap.synthetic import Vineyard, simulate, write_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
 
+SURVEYS = ["collection.json", "survey.json", "three_stac.json"]
+"""Files of a survey, beside the folders of its products."""
 VINEMAP = [sys.executable, "-m", "vinemap.cli"]
 
 
@@ -91,11 +93,13 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
     names = sorted(path.name for path in alone.iterdir())
     assert sorted(path.name for path in (folder / parcel).iterdir()) == names
     for name in names:
-        if name != paths.RUN:
+        if name not in (paths.RUN, f"{parcel}_stac.json"):  # the survey is named there
             assert contents(folder / parcel / name) == contents(alone / name), name
     records = [json.loads(paths.run_record(place).read_text()) for place in (folder / parcel, alone)]
     for record in records:
         assert record.pop("created")
+        assert len(record.pop("key")) == 64
+        assert record["files"].pop(f"{parcel}_stac.json") > 500
         assert record.pop("seconds")["All"] > 0
     assert records[0] == records[1]
 
@@ -107,7 +111,7 @@ def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
     assert f'{boundaries}: none of its 5 polygons has "nobody\'s" in a column' in outcomes["nobody's"].line()
     assert outcomes["empty"].line().startswith("empty: failed: ")
     assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
-    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "inner A", "survey.json"]
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS[:1], "inner A", *SURVEYS[1:]]
     assert [path.name for path in folder.parent.iterdir()] == ["products"]
 
 
@@ -182,14 +186,14 @@ def test_the_command(cloud, boundaries, tmp_path):
     lines = sorted(done.stdout.splitlines())
     assert [line.split(": ")[0] for line in lines] == ["A", "B", "C"]
     assert lines[0].startswith("A: 4 rows, ")
-    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", "survey.json"]
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS]
     words = "--boundaries", boundaries, "--parcel", "B", "--parcel", "empty", "--out", "out"
     done = vinemap("survey", cloud, *words, cwd=tmp_path)
     assert done.returncode == 1
     assert done.stdout.startswith("B: 4 rows, ")
     assert done.stdout.count("\n") == done.stderr.count("\n") == 1
     assert done.stderr.startswith("empty: failed: ")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["B", "survey.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["B", *SURVEYS]
 
 
 @pytest.mark.parametrize(

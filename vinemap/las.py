@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -113,6 +115,24 @@ def open_cloud(
         metric = (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
         with ahead(metric) as prepared:
             yield target, vertical_name(source), prepared
+
+
+def date_of(path: Path) -> datetime | None:
+    """Midnight (UTC) of the day that a file's header states as its date; None if it states none.
+
+    Raises
+    ------
+    OSError
+        If the file can't be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(94)
+    if len(head) < 94:
+        return None
+    day, year = struct.unpack("<HH", head[90:])
+    return (
+        datetime(year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1) if 1 <= day <= 366 and 1970 < year < 9999 else None
+    )
 
 
 @contextmanager

@@ -41,6 +41,7 @@ from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
 from vinemap.section_table import Measures, measure_sections, summarise_rows, tabulate_sections
 from vinemap.sections import cut_sections
+from vinemap.stac import parcel_item, save
 from vinemap.tiles import Collector
 
 if TYPE_CHECKING:
@@ -290,6 +291,22 @@ def follow(
         counts = {"points": points.size, "key_points_found": seen.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+        item = parcel_item(
+            draft,
+            parcel,
+            flown=recipe.flown,
+            polygon=layers["parcel"].union_all(),
+            crs=points.crs,
+            properties={
+                "version": __version__,
+                "points": points.size,
+                "rows": len(rows),
+                "rows_length_m": round(float(rows["length_m"].sum()), 2),
+                "area_m2": round(float(layers["parcel"].area.sum()), 1),
+            },
+            survey=recipe.survey,
+        )
+        save(item, paths.stac_item(draft, parcel))
         warnings = notices(rows, seen.chm, layers["parcel"], points.size)
         record = {
             "vinemap": __version__,

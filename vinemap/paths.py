@@ -79,3 +79,13 @@ def parcel_lock(folder: Path) -> Path:
 def survey_record(folder: Path) -> Path:
     """What became of the parcels of a survey, in the folder of their products."""
     return folder / "survey.json"
+
+
+def stac_item(folder: Path, name: str) -> Path:
+    """STAC item of a parcel in its product's folder, or of a survey in that of its products."""
+    return folder / f"{name}_stac.json"
+
+
+def stac_collection(folder: Path) -> Path:
+    """STAC collection of a survey's products."""
+    return folder / "collection.json"

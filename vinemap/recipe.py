@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import shapely
 
 from vinemap import __version__, paths
 from vinemap.errors import PASSING, BusyError, InputError
+from vinemap.las import date_of
 from vinemap.settings import Settings
 from vinemap.vector import read_boundary
 
@@ -105,6 +107,9 @@ class Recipe(NamedTuple):
     """CRS of the cloud's coordinates, where it is given."""
     origin: Origin | None
     """Origin of {Main}, where it is given."""
+    flown: datetime
+    survey: str | None = None
+    """Name of the survey whose parcels' products lie side by side."""
 
     @property
     def key(self) -> str:
@@ -121,6 +126,8 @@ class Recipe(NamedTuple):
             "crs": self.crs.to_wkt() if self.crs else None,
             "origin": self.origin,
             "settings": self.settings.model_dump(mode="json"),
+            "survey": self.survey,
+            "flown": self.flown.isoformat(),
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
@@ -144,7 +151,21 @@ def recipe_of(
     """
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     sources = tuple(read_source(path) for path in (cloud, boundary) if path)
-    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin)
+    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]))
+
+
+def flown(cloud: Source) -> datetime:
+    """When a cloud's survey was flown: the date in its header, or else when the file was written.
+
+    Raises
+    ------
+    InputError
+        If it can't be read.
+    """
+    try:
+        return date_of(cloud.path) or datetime.fromtimestamp(cloud.stamp[1] // 10**9, UTC)
+    except OSError as error:
+        raise _unreadable(cloud.path, error) from error
 
 
 def earlier_record(folder: Path) -> dict[str, Any] | None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of Linux's renameat2(2)."""
 PART = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
-"""Name of a product in the making, or of an earlier one on its way out."""
+"""Name of a product or a file in the making, or of an earlier one on its way out."""
 SIDE = re.compile(r"(-wal|-shm|-journal|\.aux\.xml|\.ovr|\.msk)$")
 """What SQLite and GDAL add to the name of a file for one that they leave beside it."""
 PATIENCE = 10.0
@@ -110,6 +110,22 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         _remove_empty(made)
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a text into a file that readers see whole, or not at all.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
 def unwritable(place: Path, error: OSError) -> OutputError:
     """What is said of a folder in which nothing can be written."""
     return OutputError(f"{place}: can't be written ({error.strerror or error}): choose another folder")
@@ -139,7 +155,7 @@ def _sweep(folder: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
         elif part := PART.fullmatch(path.name):
             with suppress(VinemapError), _held(paths.parcel_lock(folder / part[1]), "held"):
-                shutil.rmtree(path, ignore_errors=True)
+                _remove(path)
         elif path.name.startswith(".") and path.suffix == ".lock" and path != paths.lock(folder):
             with suppress(VinemapError), _held(path, "held"):
                 pass
@@ -148,7 +164,16 @@ def _sweep(folder: Path) -> None:
 def _remove_parts(place: Path) -> None:
     for path in place.parent.iterdir():
         if (part := PART.fullmatch(path.name)) and part[1] == place.name:
-            shutil.rmtree(path, ignore_errors=True)
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder or a file, as far as that can be done."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def _remove_empty(folders: Sequence[Path]) -> None:

@@ -19,8 +19,9 @@ from vinemap.crs import parse_crs
 from vinemap.errors import ConfigError, InputError, VinemapError, WorkerError
 from vinemap.parcel import Summary, call, follow, found
 from vinemap.pieces import split_cloud
-from vinemap.recipe import Recipe, Source, earlier_record, read_source
-from vinemap.store import workshop
+from vinemap.recipe import Recipe, Source, earlier_record, flown, read_source
+from vinemap.stac import write_collection
+from vinemap.store import workshop, write_whole
 from vinemap.vector import read_parcels
 from vinemap.workers import Worker, Workers
 
@@ -114,7 +115,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
         sources = read_source(cloud, known), read_source(boundaries, known)
         polygons = {**read_parcels(boundaries, config.parcels)}
     failures = {} if again else {one["parcel"]: one for one in earlier.get("parcels", []) if not one["heals"]}
-    crs = parse_crs(config.crs) if config.crs else None
+    crs, date = parse_crs(config.crs) if config.crs else None, flown(sources[0])
     plan = Plan(sources, [], [], config.parcels is not None)
     for name, polygon in polygons.items():
         try:
@@ -126,7 +127,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             plan.settled.append(Outcome(parcel, FAILED, reason=str(polygon)))
             continue
         own = config.of_parcel(parcel)
-        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin)
+        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin, date, config.survey)
         key = recipe.key
         record = None if again else earlier_record(folder / parcel)
         if record and (record["key"], record["parcel"]) == (key, parcel):
@@ -187,6 +188,12 @@ def map_survey(
             raise
         finally:
             _write_record(config, folder, plan, outcomes, began)
+            write_collection(
+                folder,
+                survey=config.survey,
+                flown=flown(plan.sources[0]),
+                sources=[(source.path, source.record()) for source in plan.sources],
+            )
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
@@ -322,7 +329,4 @@ def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list
         "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
         "parcels": [parcels[name] for name in sorted(parcels)],
     }
-    path = paths.survey_record(folder)
-    draft = path.with_name(f".{path.name}.part")
-    draft.write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    draft.replace(path)
+    write_whole(paths.survey_record(folder), json.dumps(record, indent=2, ensure_ascii=False))
