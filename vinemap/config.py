@@ -155,8 +155,8 @@ class EstateConfig(_Surveys):
     timezone: str = Field("UTC", description="time zone of that, as Europe/Rome")
     _given: dict[str, Any] = PrivateAttr(default_factory=dict)
 
-    def of_survey(self, name: str, cloud: Path, own: Path | None) -> SurveyConfig:
-        """What holds for a survey, whose ``own`` file may state otherwise.
+    def of_survey(self, name: str, own: Path | None, **files: Path | None) -> SurveyConfig:
+        """What holds for a survey with the ``files`` that were found, whose ``own`` file may state otherwise.
 
         Raises
         ------
@@ -167,10 +167,11 @@ class EstateConfig(_Surveys):
         stated = _read_yaml(own) if own else {}
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
+        if own:
+            stated |= {key: own.parent / str(stated[key]) for key in ("cloud", "boundaries") if stated.get(key)}
         if stated.get("parcels") and isinstance(overrides := common.get("overrides"), dict):
-            common["overrides"] = {name: overrides[name] for name in overrides if name in stated["parcels"]}
-        given: dict[str, Any] = {"survey": name, "cloud": cloud}
-        return _validated(SurveyConfig, merge(merge(common, stated), given), own or cloud)
+            common["overrides"] = {key: overrides[key] for key in overrides if key in stated["parcels"]}
+        return _validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
 
 
 def merge(common: Any, own: Any) -> Any:

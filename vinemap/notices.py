@@ -11,8 +11,9 @@ from vinemap.raster import block_sum
 
 if TYPE_CHECKING:
     import geopandas as gpd
+    from numpy.typing import NDArray
 
-    from vinemap.raster import Raster
+    from vinemap.raster import Grid, Raster
 
 SIDE = 2.0
 """Metres, about: side of the squares that points cover or don't."""
@@ -41,11 +42,8 @@ def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_poi
     n = max(1, round(SIDE / chm.grid.resolution))
     seen = block_sum(np.isfinite(chm.values).astype(np.uint16), n) > 0
     side = n * chm.grid.resolution
-    x = chm.grid.west + (np.arange(seen.shape[1]) + 0.5) * side
-    y = chm.grid.north - (np.arange(seen.shape[0]) + 0.5) * side
     polygon = shapely.union_all(parcel.geometry.to_numpy())
-    inside = np.count_nonzero(seen & shapely.contains_xy(polygon, *np.meshgrid(x, y)))
-    covered = min(1.0, inside * side**2 / max(polygon.area, side**2))
+    covered = _covered(polygon, seen, chm.grid, side)
     density = n_points / max(np.count_nonzero(seen) * side**2, 1.0)
     doubtful = int((rows["confidence"] < SURE).sum())
     remarks = {
@@ -54,3 +52,15 @@ def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_poi
         f"{doubtful} of {len(rows)} rows are doubtful (confidence below {SURE:g})": doubtful > 0,
     }
     return [remark for remark, holds in remarks.items() if holds]
+
+
+def _covered(polygon: shapely.Geometry, seen: NDArray[np.bool_], grid: Grid, side: float) -> float:
+    """Share of the squares with their centres in a polygon that were seen, among those of a raster and beyond it."""
+    shapely.prepare(polygon)
+    west, south, east, north = shapely.bounds(polygon)
+    j = np.arange(np.floor((west - grid.west) / side), np.ceil((east - grid.west) / side))
+    i = np.arange(np.floor((grid.north - north) / side), np.ceil((grid.north - south) / side))
+    inside = shapely.contains_xy(polygon, *np.meshgrid(grid.west + (j + 0.5) * side, grid.north - (i + 0.5) * side))
+    ii, jj = (index.astype(int) for index in np.meshgrid(i, j, indexing="ij"))
+    within = inside & (ii >= 0) & (jj >= 0) & (ii < seen.shape[0]) & (jj < seen.shape[1])
+    return float(seen[ii[within], jj[within]].sum() / max(np.count_nonzero(inside), 1)) if inside.any() else 1.0

@@ -318,9 +318,12 @@ def _earlier(folder: Path) -> dict[str, Any]:
 
 
 def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list[Outcome], began: datetime) -> None:
-    parcels = {outcome.parcel: asdict(outcome) for outcome in outcomes}
-    if plan.listed:  # what is known of others holds on
-        parcels = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])} | parcels
+    before = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])}
+    parcels = dict(before) if plan.listed else {}  # what is known of others holds on
+    for outcome in outcomes:
+        parcels[outcome.parcel] = asdict(outcome)
+        if outcome.state == CURRENT and before.get(outcome.parcel, {}).get("key") == outcome.key:
+            parcels[outcome.parcel] = before[outcome.parcel]
     record = {
         "vinemap": __version__,
         "survey": config.survey,

@@ -1,0 +1,109 @@
+"""Every survey that needs work, mapped each night: once now, or on a schedule.
+
+``python -m flows.nightly configs/nightly.yaml``
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+from prefect import State, flow, get_run_logger
+from prefect.artifacts import create_table_artifact
+from prefect.states import Completed, Failed
+
+from flows.survey import COLUMNS, outcomes_of, rows_of, show
+from vinemap.cli import plain_errors
+from vinemap.config import EstateConfig, load_estate
+from vinemap.errors import BusyError, InputError, VinemapError
+from vinemap.estate import Arrival, arrivals
+from vinemap.survey import FAILED, Outcome, plan_survey
+
+
+class Night(NamedTuple):
+    """What became of a survey, or why nothing did."""
+
+    survey: str
+    outcomes: list[Outcome]
+    reason: str = ""
+    failed: bool = False
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Rows of a table: one a parcel, or one for all that ended alike without being worked."""
+        if self.reason:
+            return [(self.survey, "", "", "", FAILED if self.failed else "waits", self.reason)]
+        return [(self.survey, *row) for row in rows_of(self.outcomes)]
+
+
+@flow(name="nightly", persist_result=False)
+def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
+    """Map the parcels of all surveys that need it; failed if one of them fails.
+
+    Parameters
+    ----------
+    config : str
+        File of the estate's configuration.
+    """
+    log = get_run_logger()
+    estate = load_estate(Path(config))
+    nights = []
+    for arrival in _arrivals(estate):
+        night = _survey(arrival, estate.products / arrival.name)
+        nights.append(night)
+        if night.reason:
+            (log.error if night.failed else log.info)("%s: %s", night.survey, night.reason)
+    table = [dict(zip(("survey", *COLUMNS), row, strict=True)) for night in nights for row in night.rows()]
+    create_table_artifact(table, key="nightly")
+    failed = [night.survey for night in nights if night.failed]
+    if failed:
+        message = f"{len(failed)} of {len(nights)} surveys failed, or parcels of theirs: {', '.join(failed)[:200]}"
+        return Failed(message=message, data=nights)
+    return Completed(message=f"{len(nights)} surveys", data=nights)
+
+
+def _arrivals(estate: EstateConfig) -> list[Arrival]:
+    try:
+        return list(arrivals(estate))
+    except OSError as error:
+        raise InputError(f"{estate.surveys}: can't be read ({error.strerror}): make it, or name another") from error
+
+
+def _survey(arrival: Arrival, folder: Path) -> Night:
+    """Map a survey's parcels if any needs it."""
+    if not arrival.config:
+        return Night(arrival.name, [], arrival.reason, failed=not arrival.waits)
+    try:
+        plan = plan_survey(arrival.config, folder)
+        outcomes = outcomes_of(arrival.config, folder) if plan.recipes else plan.settled
+    except BusyError as error:
+        return Night(arrival.name, [], str(error))
+    except VinemapError as error:
+        return Night(arrival.name, [], str(error), failed=True)
+    return Night(arrival.name, outcomes, failed=any(outcome.state == FAILED for outcome in outcomes))
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("config", default="configs/nightly.yaml")
+def command(config: str) -> None:
+    """Map the parcels of all surveys that need it; exit code 1 if one of them fails."""
+    load_estate(Path(config))
+    state = nightly(config, return_state=True)
+    nights: Any = state.result(raise_on_failure=False)
+    if isinstance(nights, Exception):
+        raise nights
+    show(("survey", *COLUMNS), [row for night in nights for row in night.rows()])
+    if not state.is_completed():
+        click.echo(f"vinemap: {state.message}", err=True)
+        sys.exit(1)
+
+
+def main() -> None:
+    """Run the command line."""
+    with plain_errors():
+        command.main(prog_name="python -m flows.nightly", standalone_mode=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""All parcels of a survey as a Prefect flow: every parcel is a task run, worked by a process of its own.
+
+``python -m flows.survey configs/barolo.yaml``
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from prefect import flow, get_run_logger, task
+from prefect.artifacts import create_table_artifact
+from prefect.cache_policies import NO_CACHE
+from prefect.states import Completed, Failed
+
+from flows.parcel import ensure_cloud
+from vinemap import paths
+from vinemap.cli import plain_errors
+from vinemap.config import SurveyConfig, load_survey
+from vinemap.errors import ConfigError, VinemapError
+from vinemap.survey import FAILED, Outcome, map_survey
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from prefect import State
+    from prefect.client.schemas.objects import TaskRun
+
+RETRIES = (20, 60, 180)
+"""Seconds after which what may heal is tried again."""
+COLUMNS = ("parcel", "rows", "seconds", "state", "reason")
+
+
+def as_task(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Run the work on a parcel as a Prefect task, again after a while where that may help."""
+    results = []
+
+    # It gives nothing, as Prefect would keep it.
+    @task(
+        name="parcel",
+        task_run_name=name.replace("{", "(").replace("}", ")"),
+        retries=len(RETRIES),
+        retry_delay_seconds=list(RETRIES),
+        retry_condition_fn=_may_heal,
+        cache_policy=NO_CACHE,
+        persist_result=False,
+    )
+    def parcel() -> None:
+        results.append(function(*args, **kwargs))
+
+    parcel()
+    return results[-1]
+
+
+def _may_heal(task: Any, run: TaskRun, state: State[Any]) -> bool:
+    del task, run
+    error = state.result(raise_on_failure=False)
+    return isinstance(error, VinemapError) and error.heals
+
+
+@flow(name="survey", flow_run_name="{config.survey}", persist_result=False, validate_parameters=False)
+def survey_flow(config: SurveyConfig, folder: Path, *, again: bool = False) -> State[list[Outcome]]:
+    """Map the parcels of a survey that need it; failed if one of them fails."""
+    log = get_run_logger()
+    outcomes = []
+    for outcome in map_survey(config, folder, again=again, step=as_task):
+        outcomes.append(outcome)
+        (log.error if outcome.state == FAILED else log.info)(outcome.line())
+    outcomes.sort(key=lambda outcome: outcome.parcel)
+    create_table_artifact([dict(zip(COLUMNS, row, strict=True)) for row in rows_of(outcomes)], key="survey")
+    failed = [outcome.parcel for outcome in outcomes if outcome.state == FAILED]
+    message = f"{len(outcomes)} parcels"
+    if failed:
+        return Failed(message=f"{len(failed)} of {message} failed: {', '.join(failed)[:200]}", data=outcomes)
+    return Completed(message=message, data=outcomes)
+
+
+def rows_of(outcomes: Iterable[Outcome]) -> list[tuple[str, ...]]:
+    """Rows of a table of what became of parcels, in words."""
+    return [(o.parcel, str(o.rows), f"{o.seconds:.1f}", o.state, " ".join(o.reason.split())) for o in outcomes]
+
+
+def show(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    widths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
+    for row in (columns, *rows):
+        click.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
+
+
+def outcomes_of(config: SurveyConfig, folder: Path, *, again: bool = False) -> list[Outcome]:
+    """Run the flow and tell what became of each parcel.
+
+    Raises
+    ------
+    VinemapError
+        If no parcel could be worked at all.
+    """
+    state = survey_flow(config, folder, again=again, return_state=True)
+    outcomes: Any = state.result(raise_on_failure=False)
+    if isinstance(outcomes, Exception):
+        raise outcomes
+    return list(outcomes)
+
+
+def main() -> None:
+    """Map the survey whose configuration is named on the command line."""
+    with plain_errors():
+        if len(sys.argv) != 2:
+            raise ConfigError("give a survey's configuration: python -m flows.survey configs/barolo.yaml")
+        config = load_survey(Path(sys.argv[1]))
+        ensure_cloud(config)
+        outcomes = outcomes_of(config, paths.survey_products(config.survey))
+        show(COLUMNS, rows_of(outcomes))
+        failed = sum(outcome.state == FAILED for outcome in outcomes)
+        if failed:
+            click.echo(f"vinemap: {failed} of {len(outcomes)} parcels failed", err=True)
+            sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()
