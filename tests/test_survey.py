@@ -1,9 +1,11 @@
 """Many parcels in one job: what each would be alone, and what one's fault costs the others."""
 
+import contextlib
 import json
 import os
+import random
+import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
@@ -27,6 +29,8 @@ from vinemap.vector import read_boundary
 
 SURVEYS = ["collection.json", "survey.json", "three_stac.json"]
 """Files of a survey, beside the folders of its products."""
+KILLS = int(os.environ.get("VINEMAP_KILLS", "3"))
+"""Instants at which a job is killed."""
 VINEMAP = [sys.executable, "-m", "vinemap.cli"]
 
 
@@ -67,19 +71,20 @@ def job(cloud, folder, *, boundaries, again=False, step=None, **options):
     return map_survey(config, folder, again=again, **({"step": step} if step else {}))
 
 
-def contents(path):
-    """Bytes of a file; of a GeoPackage all tables, but for the times at which they were written."""
-    if path.suffix != ".gpkg":
+def tree(folder):
+    """All files under a folder with their bytes; of the records of runs what isn't a time."""
+    return {path.relative_to(folder).as_posix(): content(path) for path in folder.rglob("*") if path.is_file()}
+
+
+def content(path):
+    if path.name not in (paths.RUN, "survey.json"):
         return path.read_bytes()
-    db = sqlite3.connect(path)
-    db.row_factory = sqlite3.Row
-    try:
-        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name")]
-        found = {name: [dict(row) for row in db.execute(f'SELECT * FROM "{name}"')] for name in tables}
-    finally:
-        db.close()
-    times = {"last_change", "update_time"}
-    return {name: [{key: row[key] for key in row.keys() - times} for row in rows] for name, rows in found.items()}
+    record = json.loads(path.read_text())
+    for name in ("created", "seconds", "began"):
+        record.pop(name, None)
+    for one in (*record.get("sources", ()), *record.get("parcels", ())):
+        one.pop("read" if "read" in one else "seconds")
+    return record
 
 
 @pytest.mark.parametrize("parcel", ["A", "B", "C", "inner A"])
@@ -88,13 +93,13 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
     alone = tmp_path / parcel
     summary = map_parcel(cloud, alone, parcel=parcel, boundary=boundaries)
     found = outcomes[parcel]
-    assert (found.state, found.rows, found.length) == (DONE, summary.rows, round(summary.length, 3))
+    assert (found.state, found.rows, found.length) == (DONE, summary.rows, summary.length)
     assert found.rows > 0
     names = sorted(path.name for path in alone.iterdir())
     assert sorted(path.name for path in (folder / parcel).iterdir()) == names
     for name in names:
         if name not in (paths.RUN, f"{parcel}_stac.json"):  # the survey is named there
-            assert contents(folder / parcel / name) == contents(alone / name), name
+            assert content(folder / parcel / name) == content(alone / name), name
     records = [json.loads(paths.run_record(place).read_text()) for place in (folder / parcel, alone)]
     for record in records:
         assert record.pop("created")
@@ -223,17 +228,18 @@ def children(group):
     return [line for line in listed.splitlines() if line.split()[0] == str(group) and "Z" not in line]
 
 
+def many(cloud, path, n):
+    """Write the polygons of the three parcels so many times each, every time under another name."""
+    parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
+    names = [f"{name}{k}" for k in range(n) for name in parcels["name"]]
+    gpd.GeoDataFrame({"name": names}, geometry=[*parcels.geometry] * n, crs=parcels.crs).to_file(path)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="no such signals here")
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     """Stopped as by Ctrl-C, to all its processes, or by a scheduler, to the first alone, while parcels are worked."""
-    parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
-    many = gpd.GeoDataFrame(
-        {"name": [f"{name}{k}" for k in range(20) for name in parcels["name"]]},
-        geometry=[*parcels.geometry] * 20,
-        crs=parcels.crs,
-    )
-    many.to_file(tmp_path / "many.gpkg")
+    many(cloud, tmp_path / "many.gpkg", 20)
     words = [*VINEMAP, "survey", cloud, "--boundaries", "many.gpkg", "--out", "out"]
     with subprocess.Popen(
         words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -252,3 +258,45 @@ def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     assert {line.split(":")[0] for line in (first + rest).splitlines()} <= done
     assert len(done) < 30
     assert all((tmp_path / "out" / name / "run.json").is_file() for name in done)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no such signals here")
+def test_a_job_that_is_killed_loses_nothing(cloud, tmp_path):
+    """Killed at any instant while it replaces products: each parcel's is whole, and the next job makes the rest."""
+    many(cloud, tmp_path / "many.gpkg", 3)
+    (tmp_path / "nine.yaml").write_text("polygon: {c: 9}\n")
+    words = "survey", cloud, "--boundaries", "many.gpkg", "--out"
+    assert vinemap(*words, "old", "--settings", "nine.yaml", cwd=tmp_path).returncode == 0
+    shutil.copytree(tmp_path / "old", tmp_path / "new")
+    began = time.monotonic()
+    assert vinemap(*words, "new", cwd=tmp_path).returncode == 0
+    lasts = time.monotonic() - began
+    old, new = tree(tmp_path / "old"), tree(tmp_path / "new")
+    assert old.keys() == new.keys()
+    products = {name.split("/")[0] for name in new if "/" in name}
+    assert len(products) == 9
+    instants = random.Random(1)
+    for _ in range(KILLS):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        shutil.copytree(tmp_path / "old", tmp_path / "out")
+        with subprocess.Popen(
+            [*VINEMAP, *map(str, words), "out"], cwd=tmp_path, stdout=subprocess.DEVNULL, start_new_session=True
+        ) as job:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                job.wait(instants.uniform(0, lasts))
+            job.kill()
+        deadline = time.monotonic() + 20
+        while children(job.pid) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert children(job.pid) == []
+        left = tree(tmp_path / "out")
+        for product in products:
+            assert part(left, product) in (part(old, product), part(new, product))
+        done = vinemap(*words, "out", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert tree(tmp_path / "out") == new
+        assert {path.name for path in (tmp_path / "out").iterdir()} == {*products, *SURVEYS[:2], "three_stac.json"}
+
+
+def part(files, folder):
+    return {name: content for name, content in files.items() if name.startswith(f"{folder}/")}

@@ -280,8 +280,8 @@ def follow(
         }
 
         def write() -> None:
-            plain = settings.product.plain
-            write_product(draft, parcel, layers, (seen.dtm, seen.chm), seen.field, meshes, points, plain=plain)
+            how: dict[str, Any] = {"date": recipe.flown, "plain": settings.product.plain}
+            write_product(draft, parcel, layers, (seen.dtm, seen.chm), seen.field, meshes, points, **how)
             if settings.product.classified:
                 classify = partial(classify_points, leaves=_leaves(seen, settings))
                 write_classified(seen.cloud, classify, paths.classified_cloud(draft, parcel))
@@ -291,6 +291,7 @@ def follow(
         counts = {"points": points.size, "key_points_found": seen.n_key_points}
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+        length = round(float(rows["length_m"].sum()), 3)
         item = parcel_item(
             draft,
             parcel,
@@ -301,7 +302,7 @@ def follow(
                 "version": __version__,
                 "points": points.size,
                 "rows": len(rows),
-                "rows_length_m": round(float(rows["length_m"].sum()), 2),
+                "rows_length_m": length,
                 "area_m2": round(float(layers["parcel"].area.sum()), 1),
             },
             survey=recipe.survey,
@@ -319,6 +320,7 @@ def follow(
             "vertical_datum": points.vertical,
             "origin": origin._asdict(),
             "counts": counts,
+            "length_m": length,
             "modelling": modelling.to_dict() if len(model.table) else None,
             "warnings": warnings,
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
@@ -328,7 +330,6 @@ def follow(
             "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    length = float(rows["length_m"].sum())
     return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(warnings))
 
 

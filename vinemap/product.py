@@ -17,6 +17,7 @@ from vinemap.raster import Raster, RowField, write_cog
 from vinemap.vector import write_geopackage
 
 if TYPE_CHECKING:
+    from datetime import datetime
     from pathlib import Path
 
     from pyproj import CRS
@@ -79,11 +80,12 @@ def write_product(
     meshes: list[Mesh],
     points: Cloud,
     *,
+    date: datetime,
     plain: bool = False,
 ) -> None:
     """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
 
-    ``plain`` meshes need no extension of glTF.
+    The ``date`` is the survey's. ``plain`` meshes need no extension of glTF.
 
     Raises
     ------
@@ -115,6 +117,6 @@ def write_product(
         )
 
     def write_layers() -> None:
-        write_geopackage(layers, paths.geopackage(folder, parcel))
+        write_geopackage(layers, paths.geopackage(folder, parcel), date=date)
 
     in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes])

@@ -168,11 +168,23 @@ def flown(cloud: Source) -> datetime:
         raise _unreadable(cloud.path, error) from error
 
 
-def earlier_record(folder: Path) -> dict[str, Any] | None:
-    """What ``run.json`` tells of the product in a folder; None where there is none, or not all of its files."""
+class Product(NamedTuple):
+    """A product that lies in a folder, by the record of its run."""
+
+    key: str
+    parcel: str
+    rows: int
+    length: float
+    warnings: tuple[str, ...]
+
+
+def product_in(folder: Path) -> Product | None:
+    """The product in a folder; None where there is none, or not all of its files."""
     try:
-        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        whole = all((folder / name).stat().st_size == size for name, size in record["files"].items())
-        return record if whole and {"key", "parcel", "counts"} <= record.keys() else None
+        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        if any((folder / name).stat().st_size != size for name, size in record["files"].items()):
+            return None
+        known = record["key"], record["parcel"], record["counts"]["rows"], record["length_m"]
+        return Product(*known, tuple(record["warnings"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

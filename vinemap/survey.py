@@ -6,7 +6,7 @@ import contextvars
 import json
 import time
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
@@ -19,7 +19,7 @@ from vinemap.crs import parse_crs
 from vinemap.errors import ConfigError, InputError, VinemapError, WorkerError
 from vinemap.parcel import Summary, call, follow, found
 from vinemap.pieces import split_cloud
-from vinemap.recipe import Recipe, Source, earlier_record, flown, read_source
+from vinemap.recipe import Recipe, Source, flown, product_in, read_source
 from vinemap.stac import write_collection
 from vinemap.store import workshop, write_whole
 from vinemap.vector import read_parcels
@@ -106,13 +106,13 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
     earlier = _earlier(folder)
-    known = [Source(Path(s["path"]), s["sha256"], tuple(s["stamp"]), s["read"]) for s in earlier.get("sources", [])]
+    hashed = [Source(Path(s["path"]), s["sha256"], tuple(s["stamp"]), s["read"]) for s in earlier.get("sources", [])]
     polygons: dict[str, Boundary | InputError | None]
     sources: tuple[Source, ...]
     if config.boundaries is None and config.parcels is None and not boundaries.exists():
-        sources, polygons = (read_source(cloud, known),), {config.survey: None}
+        sources, polygons = (read_source(cloud, hashed),), {config.survey: None}
     else:
-        sources = read_source(cloud, known), read_source(boundaries, known)
+        sources = read_source(cloud, hashed), read_source(boundaries, hashed)
         polygons = {**read_parcels(boundaries, config.parcels)}
     failures = {} if again else {one["parcel"]: one for one in earlier.get("parcels", []) if not one["heals"]}
     crs, date = parse_crs(config.crs) if config.crs else None, flown(sources[0])
@@ -129,9 +129,10 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
         own = config.of_parcel(parcel)
         recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin, date, config.survey)
         key = recipe.key
-        record = None if again else earlier_record(folder / parcel)
-        if record and (record["key"], record["parcel"]) == (key, parcel):
-            plan.settled.append(Outcome(parcel, CURRENT, rows=record["counts"].get("rows", 0), key=key))
+        product = None if again else product_in(folder / parcel)
+        if product and (product.key, product.parcel) == (key, parcel):
+            known = product.rows, product.length, 0.0, "; ".join(product.warnings)
+            plan.settled.append(Outcome(parcel, CURRENT, *known, key=key))
         elif failures.get(parcel, {}).get("key") == key:
             plan.settled.append(Outcome(**failures[parcel]))
         else:
@@ -318,12 +319,8 @@ def _earlier(folder: Path) -> dict[str, Any]:
 
 
 def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list[Outcome], began: datetime) -> None:
-    before = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])}
-    parcels = dict(before) if plan.listed else {}  # what is known of others holds on
-    for outcome in outcomes:
-        parcels[outcome.parcel] = asdict(outcome)
-        if outcome.state == CURRENT and before.get(outcome.parcel, {}).get("key") == outcome.key:
-            parcels[outcome.parcel] = before[outcome.parcel]
+    parcels = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])} if plan.listed else {}
+    parcels |= {o.parcel: asdict(replace(o, state=DONE if o.state == CURRENT else o.state)) for o in outcomes}
     record = {
         "vinemap": __version__,
         "survey": config.survey,

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 import unicodedata
 import warnings
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from pyproj import CRS
 
+EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 PARCEL_LAYER = "parcel"
 NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
 TEXT, WHOLE, REAL = "str", "int64", "float64"
@@ -91,12 +95,32 @@ def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
     return frame[[*columns, "geometry"]].astype(columns)
 
 
-def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
-    """Write all layers of the contract, and the styles that QGIS applies by itself; OSError if that can't be."""
+def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date: datetime = EPOCH) -> None:
+    """Write all layers of the contract, and the styles that QGIS applies by itself.
+
+    Parameters
+    ----------
+    layers : mapping of str to GeoDataFrame
+        The layers by name.
+    path : Path
+        The file.
+    date : datetime
+        Stands in it as that of the last change, so that the same layers always give the same file.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{date.astimezone(UTC):%Y-%m-%dT%H:%M:%S.000Z}"})
     try:
         _write_layers(layers, path)
     except (DataSourceError, DataLayerError, FeatureError) as error:
+        if "full" in str(error):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
         raise OSError(f"GeoPackage: {' '.join(str(error).split())}") from error
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
 def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
