@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -14,6 +15,11 @@ RUN = "run.json"
 def stem(cloud: Path) -> str:
     """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
     return re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))[:64] or "cloud"
+
+
+def shown(path: Path) -> str:
+    """A path as it can be printed and stored, even if its name isn't Unicode."""
+    return os.fsencode(path).decode(errors="replace")
 
 
 def survey_cloud(survey: str) -> Path:
