@@ -17,7 +17,7 @@ def stem(cloud: Path) -> str:
     return re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))[:64] or "cloud"
 
 
-def shown(path: Path) -> str:
+def shown(path: Path | str) -> str:
     """A path as it can be printed and stored, even if its name isn't Unicode."""
     return os.fsencode(path).decode(errors="replace")
 
