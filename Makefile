@@ -18,7 +18,7 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel test check accuracy bench tune clean
+.PHONY: help parcel survey test check accuracy bench tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -32,6 +32,14 @@ ifeq ($(strip $(PARCEL)),)
 	@echo "Name the parcel, for example: make parcel PARCEL=F" >&2; exit 2
 else
 	@$(BIN)/python -m flows.parcel "$$CONFIG" "$$PARCEL"
+endif
+
+survey: export SURVEY := $(SURVEY)
+survey: $(if $(strip $(SURVEY)),$(READY)) ## Map all parcels of a survey that need it: make survey SURVEY=barolo [AGAIN=1]
+ifeq ($(strip $(SURVEY)),)
+	@echo "Name the survey, for example: make survey SURVEY=barolo" >&2; exit 2
+else
+	@$(BIN)/python -m flows.survey "$$SURVEY" $(if $(AGAIN),--again)
 endif
 
 test: $(READY) ## Run the tests

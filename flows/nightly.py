@@ -16,8 +16,8 @@ from prefect.states import Completed, Failed
 
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap.cli import plain_errors
-from vinemap.config import EstateConfig, load_estate
-from vinemap.errors import BusyError, InputError, VinemapError
+from vinemap.config import load_estate
+from vinemap.errors import BusyError, VinemapError
 from vinemap.estate import Arrival, arrivals
 from vinemap.survey import FAILED, Outcome, plan_survey
 
@@ -49,7 +49,7 @@ def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
     log = get_run_logger()
     estate = load_estate(Path(config))
     nights = []
-    for arrival in _arrivals(estate):
+    for arrival in arrivals(estate):
         night = _survey(arrival, estate.products / arrival.name)
         nights.append(night)
         if night.reason:
@@ -61,13 +61,6 @@ def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
         message = f"{len(failed)} of {len(nights)} surveys failed, or parcels of theirs: {', '.join(failed)[:200]}"
         return Failed(message=message, data=nights)
     return Completed(message=f"{len(nights)} surveys", data=nights)
-
-
-def _arrivals(estate: EstateConfig) -> list[Arrival]:
-    try:
-        return list(arrivals(estate))
-    except OSError as error:
-        raise InputError(f"{estate.surveys}: can't be read ({error.strerror}): make it, or name another") from error
 
 
 def _survey(arrival: Arrival, folder: Path) -> Night:
