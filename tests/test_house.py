@@ -56,7 +56,7 @@ MAY_IMPORT = {
     "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel", "survey"},
     "__main__": {"cli"},
-    "flows": CHAIN | {"parcel", "cli", "flows"},
+    "flows": CHAIN | {"parcel", "cli", "processes", "flows"},
 }
 
 
