@@ -14,6 +14,7 @@ from prefect import State, flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 from prefect.states import Completed, Failed
 
+from flows.serving import serve
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap.cli import plain_errors
 from vinemap.config import load_estate
@@ -79,9 +80,15 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("config", default="configs/nightly.yaml")
-def command(config: str) -> None:
+@click.option("--serve", "served", is_flag=True, help="Stay, and do it when CONFIG says.")
+@click.option("--every", type=click.FloatRange(1), help="Seconds from run to run, instead of CONFIG's cron.")
+def command(config: str, served: bool, every: float | None) -> None:
     """Map the parcels of all surveys that need it; exit code 1 if one of them fails."""
-    load_estate(Path(config))
+    estate = load_estate(Path(config))
+    if served:
+        schedule = {"cron": estate.cron, "timezone": estate.timezone, "every": every}
+        serve("flows.nightly.nightly", parameters={"config": config}, **schedule)
+        return
     state = nightly(config, return_state=True)
     nights: Any = state.result(raise_on_failure=False)
     if isinstance(nights, Exception):

@@ -38,6 +38,11 @@ def survey_products(survey: str) -> Path:
     return DATA / "products" / survey
 
 
+def prefect_home() -> Path:
+    """Folder of the Prefect server that runs flows on a schedule: its database and its log."""
+    return DATA / ".prefect"
+
+
 def product_folder(survey: str, parcel: str) -> Path:
     """Folder of a parcel's product."""
     return survey_products(survey) / parcel
