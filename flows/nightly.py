@@ -86,8 +86,8 @@ def command(config: str, served: bool, every: float | None) -> None:
     """Map the parcels of all surveys that need it; exit code 1 if one of them fails."""
     estate = load_estate(Path(config))
     if served:
-        schedule = {"cron": estate.cron, "timezone": estate.timezone, "every": every}
-        serve("flows.nightly.nightly", parameters={"config": config}, **schedule)
+        given = {"config": config}
+        serve("flows.nightly.nightly", parameters=given, cron=estate.cron, timezone=estate.timezone, every=every)
         return
     state = nightly(config, return_state=True)
     nights: Any = state.result(raise_on_failure=False)

@@ -1,25 +1,19 @@
 """The schedule: a real Prefect server on loopback, runs that are started by it, and what stopping leaves."""
 
-import json
 import os
 import re
 import shutil
 import signal
 import socket
-import subprocess
-import sys
-import time
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from urllib.request import Request, urlopen
 
 import pytest
 import yaml
+from place import ROOT, Place, gone, wait
 
 from vinemap.processes import descendants
 
-ROOT = Path(__file__).parents[1]
 JOB = """
 import time
 from pathlib import Path
@@ -36,13 +30,6 @@ def job(seconds: float = 0):
         return Failed(message="1 survey failed")
     return Completed(message="done")
 """
-SERVE = """
-import json, sys
-from flows.serving import serve
-from vinemap.cli import plain_errors
-with plain_errors():
-    serve("job.job", **json.loads(sys.argv[1]))
-"""
 NIGHTLY = """
 from pathlib import Path
 from prefect import flow, get_run_logger
@@ -55,91 +42,10 @@ def nightly(config: str):
 """
 
 
-def wait(condition, *, patience=120):
-    """Return what a condition gives as soon as that is true."""
-    deadline = time.monotonic() + patience
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it never came true"
-        time.sleep(0.1)
-    return found
-
-
-def gone(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
-
-
-class Place:
-    """A folder with a flow, from which schedules are run on a port of their own."""
-
-    def __init__(self, folder):
-        self.folder = folder
-        (folder / "job.py").write_text(JOB)
-        with socket.create_server(("127.0.0.1", 0)) as one:
-            self.port = one.getsockname()[1]
-        self.api = f"http://127.0.0.1:{self.port}/api"
-        kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-        self.environment = kept | {
-            "PYTHONPATH": f"{ROOT}:{folder}",
-            "PREFECT_API_URL": self.api,
-            "PREFECT_RUNNER_POLL_FREQUENCY": "1",
-            "PREFECT_SERVER_SERVICES_SCHEDULER_RECENT_DEPLOYMENTS_LOOP_SECONDS": "1",
-            "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-            "DO_NOT_TRACK": "1",
-        }
-
-    def start(self, said, **options):
-        options = {"parameters": {}} | options
-        command = [sys.executable, "-c", SERVE, json.dumps(options)]
-        return subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=said, stderr=subprocess.STDOUT)
-
-    def fails(self, **options):
-        with (self.folder / "failed.txt").open("w+b") as said:
-            process = self.start(said, **options)
-            assert process.wait(60) == 2
-            said.seek(0)
-            return said.read().decode()
-
-    @contextmanager
-    def serving(self, **options):
-        """Give a process that serves, and what it says; nothing of it is left."""
-        path = self.folder / "said.txt"
-        with path.open("wb") as said, self.start(said, **options) as process:
-            try:
-                while "Next run" not in path.read_text():
-                    assert process.poll() is None, path.read_text()
-                    time.sleep(0.1)
-                yield process, path
-            finally:
-                processes = [process.pid, *descendants(process.pid)]
-                process.terminate()
-                try:
-                    process.wait(60)
-                finally:
-                    process.kill()
-                wait(lambda: all(map(gone, processes)))
-
-    def ask(self, path, body):
-        request = Request(self.api + path, json.dumps(body).encode(), {"Content-Type": "application/json"})
-        with urlopen(request, timeout=30) as answer:
-            return json.load(answer)
-
-    def runs(self, state=None):
-        chosen = {"flow_runs": {"state": {"type": {"any_": [state]}}}} if state else {}
-        return self.ask("/flow_runs/filter", chosen | {"sort": "EXPECTED_START_TIME_ASC"})
-
-    def prefect(self, *args, cwd):
-        command = [sys.executable, "-m", "prefect", *args]
-        environment = self.environment | {"PREFECT_HOME": str(self.folder / "client")}
-        options = {"cwd": cwd, "env": environment, "stdin": subprocess.DEVNULL, "timeout": 120}
-        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("place")
+    (folder / "job.py").write_text(JOB)
     yield Place(folder)
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -252,6 +158,7 @@ def test_port_of_another(place):
 
 def test_folder_that_cant_be_written(tmp_path):
     (tmp_path / "data").write_text("")
+    (tmp_path / "job.py").write_text(JOB)
     line = Place(tmp_path).fails()
     assert "data/.prefect: can't be written" in line
     assert line.count("\n") == 1
