@@ -1,8 +1,10 @@
 """Configurations: what they hold, and what is said of a wrong one."""
 
+from pathlib import Path
+
 import pytest
 
-from vinemap.config import check_name, choose_parcel, load_settings, load_survey
+from vinemap.config import check_name, choose_parcel, load_estate, load_settings, load_survey
 from vinemap.errors import ConfigError
 from vinemap.settings import Settings
 
@@ -110,3 +112,205 @@ def test_defaults_of_settings_are_those_of_the_stages():
             parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
             defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
             assert defaults == options | {k: Settings().cover.model_dump()[k] for k in defaults if k not in options}
+
+
+ODD = {
+    "python": "a: !!python/object/apply:os.system [ls]",
+    "tag": "a: !vine 5",
+    "date": "a: !!timestamp may",
+    "bool": "a: !!bool maybe",
+    "int": "a: !!int maybe",
+    "binary number": "a: 0b_",
+    "digits": "a: " + "9" * 5000,
+    "list as a key": "? [1]\n: 2",
+    "tab": "\t- a",
+    "two": "a: 1\n---\na: 2",
+    "twice": "a: 1\na: 2",
+    "twice below": "a: {b: 1, c: 2, b: 3}",
+    "deep list": "[" * 800,
+    "deep keys": "{a: " * 1000,
+    "nul": "a: \0",
+    "not there": "a: *b",
+}
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_odd_yaml(write, what):
+    for load in (load_survey, load_estate, load_settings):
+        with pytest.raises(ConfigError, match=r"survey\.yaml: no valid YAML") as error:
+            load(write(ODD[what]))
+        assert "\n" not in str(error.value)
+
+
+def test_other_encodings(tmp_path):
+    path = tmp_path / "survey.yaml"
+    path.write_bytes("\ufeffsurvey: Cà\r\nparcels: [é]\r\n".encode())
+    assert load_survey(path).parcels == ["é"]
+    for encoding in ("utf-16", "latin-1"):
+        path.write_text("survey: Cà\n", encoding=encoding)
+        with pytest.raises(ConfigError, match="no valid YAML"):
+            load_survey(path)
+
+
+@pytest.mark.parametrize("key", ["a", "survey", "parcels", "origin", "overrides", "settings", "job"])
+def test_laughs_are_few(write, key):
+    """Lists of nine times the same, ten deep: 3.5 milliards of words if somebody wrote them out."""
+    lists = "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 10))
+    with pytest.raises(ConfigError) as error:
+        load_survey(write(f"a0: &a0 [ha, ha]\n{lists}{key}: *a9\n"))
+    assert len(str(error.value)) < 5000
+
+
+@pytest.mark.parametrize("text", ["&a [*a]", "survey: &a [*a]", "&a {survey: x, settings: *a, overrides: {A: *a}}"])
+def test_what_holds_itself(write, text):
+    with pytest.raises(ConfigError):
+        load_survey(write(text))
+
+
+@pytest.mark.parametrize("load", [load_survey, load_estate, load_settings])
+def test_files_that_cannot_be_read(tmp_path, load, monkeypatch):
+    with pytest.raises(ConfigError, match="no such file"):
+        load(tmp_path)
+    with pytest.raises(ConfigError, match="can't be read"):
+        load(tmp_path / ("x" * 300))
+    (tmp_path / "a.yaml").touch()
+    monkeypatch.setattr(Path, "read_text", lambda *words, **options: (_ for _ in ()).throw(PermissionError(13, "no")))
+    with pytest.raises(ConfigError, match=r"a\.yaml: can't be read \(no\)"):
+        load(tmp_path / "a.yaml")
+
+
+def test_names_that_yaml_takes_for_something_else(write):
+    config = load_survey(write("survey: 2026-06-01\nparcels: ['no', '1', 2026-06-01, 7.b, 1e, 'null']\n"))
+    assert config.survey == "2026-06-01"
+    assert config.parcels == ["no", "1", "2026-06-01", "7.b", "1e", "null"]
+    for word in ("no", "1", "1.5", "012", "off", "1_000", "1:30"):
+        with pytest.raises(ConfigError, match=r"parcels\.1 = .*: put it in quotes$"):
+            load_survey(write(f"survey: x\nparcels: [A, {word}]\n"))
+        with pytest.raises(ConfigError, match="put it in quotes"):
+            load_survey(write(f"survey: x\noverrides: {{{word}: {{}}}}\n"))
+
+
+SURROGATE = '"\\ud800"'
+
+
+@pytest.mark.parametrize("name", ["..", "/etc", "'C:'", "CON", "nul.txt", "a/b", "' '", "-a", "''", "a*", SURROGATE])
+def test_names_of_surveys_parcels_and_overrides(write, name):
+    for text in (
+        f"survey: {name}\n",
+        f"survey: x\nparcels: [A, {name}]\n",
+        f"survey: x\noverrides: {{{name}: {{}}}}\n",
+    ):
+        with pytest.raises(ConfigError, match="can't name a file") as error:
+            load_survey(write(text))
+        assert str(error.value).encode()
+
+
+def test_names_are_composed(write):
+    config = load_survey(write("survey: Ca\u0300\nparcels: [e\u0301]\noverrides: {é: {origin: [44, 7, 100]}}\n"))
+    assert (config.survey, config.parcels) == ("Cà", ["é"])
+    assert config.of_parcel("é").origin.alt == 100
+    assert choose_parcel(config, "e\u0301") == "é"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("overrides: {A: {setings: {}}}", "overrides.A.setings: did you mean 'settings'?"),
+        ("overrides: {A: {settings: {gruond: {}}}}", "overrides.A.settings.gruond: did you mean 'ground'?"),
+        (
+            "overrides: {A: {settings: {ground: {resolutoin: 1}}}}",
+            "overrides.A.settings.ground.resolutoin: did you mean 'resolution'?",
+        ),
+        ("overrides: {A: {cloud: b.laz}}", "overrides.A.cloud: known are origin, settings"),
+        ("overides: {}", "overides: did you mean 'overrides'?"),
+        ("job: {limt: 1}", "job.limt: did you mean 'limit'?"),
+    ],
+)
+def test_misspelt_keys_at_every_level(write, text, said):
+    with pytest.raises(ConfigError) as error:
+        load_survey(write(f"survey: x\n{text}\n"))
+    assert str(error.value).endswith(f"survey.yaml: unknown key {said}")
+
+
+def test_what_is_wrong_for_all_is_said_once(write):
+    text = "survey: x\nsettings: {polygon: {c: 4}}\norigin: [0, 999, 0]\noverrides: {A: {}, B: {settings: {fit: {}}}}\n"
+    with pytest.raises(ConfigError) as error:
+        load_survey(write(text))
+    assert str(error.value).count("polygon.c = 4") == str(error.value).count("lies nowhere") == 1
+    with pytest.raises(ConfigError, match=r"overrides\.B\.settings\.polygon\.c = 3"):
+        load_survey(write("survey: x\noverrides: {A: {}, B: {settings: {polygon: {c: 3}}}}\n"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "job: {limit: .inf}",
+        "job: {limit: .nan}",
+        "job: {limit: 0}",
+        "job: {memory: 0.1}",
+        "job: {workers: 0}",
+        "job: {engine: dask}",
+        "job: {scheduler: 'tcp://a:8786'}",
+        "origin: [.nan, 7, 1]",
+        "origin: [44, 7, .inf]",
+        "origin: [44, 181, 0]",
+        "origin: [44, 7]",
+        "settings: {ground: {resolution: .nan}}",
+        "settings: {cover: {high: -.inf}}",
+        "crs: EPSG:99",
+        "parcels: []",
+        "parcels: A",
+        "overrides: {A: 5}",
+        "parcels: [A]\noverrides: {B: {}}",
+        "simulate: barolo",
+    ],
+)
+def test_values_that_cannot_be(write, text):
+    with pytest.raises(ConfigError):
+        load_survey(write(f"survey: x\n{text}\n"))
+
+
+def test_parcels_inherit_what_they_leave_open(write):
+    config = load_survey(
+        write(
+            "survey: x\norigin: [44, 7, 100]\nsettings: {polygon: {c: 9}, fit: {smoothing: 5}}\n"
+            "overrides:\n  A: {settings: {fit: {min_gap: 1}}}\n  B: {origin: [45, 8, 0], settings: {polygon: {c: 11}}}\n"
+            "  C:\n"
+        )
+    )
+    other, a, b, c = (config.of_parcel(name) for name in ("other", "A", "B", "C"))
+    assert other == c
+    assert (other.origin.lat, other.settings.polygon.c, other.settings.fit.smoothing) == (44, 9, 5)
+    assert (a.origin.lat, a.settings.polygon.c, a.settings.fit.smoothing, a.settings.fit.min_gap) == (44, 9, 5, 1)
+    assert (b.origin.lat, b.settings.polygon.c, b.settings.fit.smoothing) == (45, 11, 5)
+
+
+def test_surveys_inherit_what_they_leave_open(write, tmp_path):
+    """Estate, survey, parcel: the nearest counts, key by key."""
+    estate = load_estate(
+        write(
+            "settle: 5\ncrs: EPSG:32632\nsettings: {polygon: {c: 9}, fit: {smoothing: 5}}\njob: {limit: 60, workers: 1}\n"
+            "overrides: {A: {settings: {polygon: {c: 10}}}, e\u0301: {settings: {polygon: {c: 12}}}}\n"
+        )
+    )
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        "settings: {fit: {smoothing: 6}}\njob: {limit: 90}\noverrides: {A: {settings: {fit: {min_gap: 2}}}}\n"
+    )
+    config = estate.of_survey("may", own)
+    assert (config.survey, config.crs, config.job.limit, config.job.workers) == ("may", "EPSG:32632", 90, 1)
+    assert (config.settings.polygon.c, config.settings.fit.smoothing) == (9, 6)
+    a = config.of_parcel("A").settings
+    assert (a.polygon.c, a.fit.smoothing, a.fit.min_gap) == (10, 6, 2)
+    own.write_text("parcels: [é, B]\n", encoding="utf-8")
+    config = estate.of_survey("june", own)
+    assert config.of_parcel("é").settings.polygon.c == 12
+    assert list(config.overrides) == ["é"]
+    assert estate.of_survey("may", None, cloud=Path("a.laz")).cloud == Path("a.laz")
+    assert list(estate.of_survey("may", None).overrides) == ["A", "é"]
+
+
+def test_a_parcel_that_states_nothing_is_no_other_for_it(write):
+    """What it leaves open isn't taken from the defaults."""
+    config = load_survey(write("survey: x\nsettings: {polygon: {c: 9}}\noverrides: {A: {settings: {}}}\n"))
+    assert config.of_parcel("A") == config.of_parcel("B")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import reprlib
 import unicodedata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
@@ -30,6 +31,8 @@ DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 LONGEST_NAME = 64
 MOST_BYTES = 160
 """Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 80
 
 
 def check_name(name: str) -> str:
@@ -169,14 +172,18 @@ class EstateConfig(_Surveys):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
             stated |= {key: own.parent / str(stated[key]) for key in ("cloud", "boundaries") if stated.get(key)}
-        if stated.get("parcels") and isinstance(overrides := common.get("overrides"), dict):
-            common["overrides"] = {key: overrides[key] for key in overrides if key in stated["parcels"]}
+        parcels, overrides = stated.get("parcels"), common.get("overrides")
+        if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
+            composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}
+            common["overrides"] = {
+                key: own for key, own in overrides.items() if unicodedata.normalize("NFC", str(key)) in composed
+            }
         return _validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
 
 
 def merge(common: Any, own: Any) -> Any:
     """Options with others laid over them, key by key."""
-    if isinstance(common, dict) and isinstance(own, dict):
+    if isinstance(common, dict) and isinstance(own, dict) and common is not own:
         return common | {key: merge(common.get(key), value) for key, value in own.items()}
     return common if own is None else own
 
@@ -251,17 +258,18 @@ class _Loader(yaml.SafeLoader):
 
 
 def _read_yaml(path: Path) -> Any:
-    if not path.is_file():
-        folder = path.parent if path.parent.is_dir() else Path()
-        known = [str(p) for p in sorted(folder.glob("*.yaml"))]
-        raise ConfigError(f"{path}: no such file" + (f": {_nearest(str(path), known)}" if known else ""))
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - a SafeLoader
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"{path}: no valid YAML ({reason})") from error
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+        folder = path.parent if path.parent.is_dir() else Path()
+        known = [str(p) for p in sorted(folder.glob("*.yaml"))]
+        hint = f": {_nearest(str(path), known)}" if known else ""
+        raise ConfigError(f"{path}: no such file{hint}") from error
     except OSError as error:
         raise ConfigError(f"{path}: can't be read ({error.strerror})") from error
+    except Exception as error:  # a YAMLError, or others of tags in odd places
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path}: no valid YAML ({reason})") from error
     return {} if data is None else data
 
 
@@ -275,8 +283,9 @@ def _validated(model: type[M], data: Any, path: Path | None) -> M:
 
 
 def _own(errors: list[ErrorDetails]) -> list[ErrorDetails]:
-    common = {(error["loc"], str(error["input"])) for error in errors}
-    return [e for e in errors if e["loc"][:1] != ("overrides",) or (e["loc"][2:], str(e["input"])) not in common]
+    known = [(error, _short.repr(error["input"])) for error in errors]
+    common = {(error["loc"], value) for error, value in known}
+    return [e for e, value in known if e["loc"][:1] != ("overrides",) or (e["loc"][2:], value) not in common]
 
 
 def _explain(error: ErrorDetails, model: type[Options]) -> str:
@@ -287,8 +296,9 @@ def _explain(error: ErrorDetails, model: type[Options]) -> str:
     if error["type"] == "missing":
         return f"{place} is missing"
     message = error["msg"].removeprefix("Value error, ")
-    value = repr(error["input"])
-    hint = f": put it in quotes, '{error['input']}'" if error["type"] == "string_type" else ""
+    value = _short.repr(error["input"])
+    a_word = error["type"] == "string_type" and isinstance(error["input"], (bool, int, float))
+    hint = ": put it in quotes" if a_word else ""
     return f"{place} = {value if len(value) < 80 else value[:80] + '…'}: {message[0].lower()}{message[1:]}{hint}"
 
 

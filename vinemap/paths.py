@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -21,6 +22,11 @@ def stem(cloud: Path) -> str:
 def configuration(survey: str) -> Path:
     """Configuration of a survey."""
     return Path("configs") / f"{survey}.yaml"
+
+
+def shown(path: Path | str) -> str:
+    """A path as it can be printed and stored, even if its name isn't Unicode."""
+    return os.fsencode(path).decode(errors="replace")
 
 
 def survey_cloud(survey: str) -> Path:

@@ -49,9 +49,13 @@ class Source(NamedTuple):
         Raises
         ------
         BusyError
-            If it isn't.
+            If it isn't, or is gone, as with its disk.
         """
-        if _stamp(self.path) != self.stamp:
+        try:
+            same = _stamp(self.path) == self.stamp
+        except InputError:
+            same = False
+        if not same:
             raise BusyError(f"{self.path}: changed while it was read: try again when it stays as it is")
 
 
@@ -61,10 +65,12 @@ def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
     Raises
     ------
     InputError
-        If the file can't be read.
+        If the file can't be read, or its name can't be written down.
     BusyError
         If it changes meanwhile.
     """
+    if (shown := paths.shown(path)) != str(path):
+        raise InputError(f"{shown}: its name isn't Unicode: rename it")
     began, stamp = time.time(), _stamp(path)
     for source in known:
         if (source.path, source.stamp) == (path, stamp) and max(stamp[1:3]) < (source.read - SETTLED) * 1e9:

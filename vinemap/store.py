@@ -79,7 +79,7 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
     drafts : Path, optional
         Folder for it in the making, where somebody clears up even if this process dies.
     within : Path, optional
-        Folder of the survey's products, which the target must not lead out of.
+        Folder of the survey's products, in which the target must lie itself, and not be a link.
 
     Raises
     ------
@@ -88,9 +88,9 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
     BusyError
         If another run is at work there.
     """
-    place = target.resolve()
-    if within and not place.is_relative_to(within.resolve()):
-        raise OutputError(f"{target}: is a link that leads out of {within}: put a folder in its place")
+    place = Path(os.path.realpath(target))
+    if within and place != within.resolve() / target.name:
+        raise OutputError(f"{target}: is a link to {place}: put a folder in its place")
     made = [folder for folder in place.parents if not folder.exists()]
     draft = (drafts or place.parent) / f".{place.name}.{uuid.uuid4().hex[:8]}.part"
     try:
@@ -152,15 +152,15 @@ def _held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what runs have left that were killed."""
+    """Remove what runs have left that were killed, as far as that can be done."""
     for path in folder.iterdir():
         if path.name.startswith(paths.PIECES):
             shutil.rmtree(path, ignore_errors=True)
         elif part := PART.fullmatch(path.name):
-            with suppress(VinemapError), _held(paths.parcel_lock(folder / part[1]), "held"):
+            with suppress(VinemapError, OSError), _held(paths.parcel_lock(folder / part[1]), "held"):
                 _remove(path)
         elif path.name.startswith(".") and path.suffix == ".lock" and path != paths.lock(folder):
-            with suppress(VinemapError), _held(path, "held"):
+            with suppress(VinemapError, OSError), _held(path, "held"):
                 pass
 
 

@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 LENGTH = struct.Struct("<Q")
 """Of the number of bytes that stands before a message."""
-SERVE = "import sys; from vinemap.workers import serve; serve(*map(int, sys.argv[1:]))"
+SERVE = "import sys; sys.path[:] = sys.argv[3:]; from vinemap.workers import serve; serve(*map(int, sys.argv[1:3]))"
 KILLED = {"SIGKILL": "killed by the system, perhaps for want of memory", "SIGSEGV": "a segmentation fault"}
 
 
@@ -46,7 +46,7 @@ class Worker:
     """
 
     def __init__(self, *, cores: int = 1, memory: int | None = None) -> None:
-        self._command = [sys.executable, "-c", SERVE, str(cores), str(memory or 0)]
+        self._command = [sys.executable, "-c", SERVE, str(cores), str(memory or 0), *sys.path]
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] | None = None
         self._stopped = False
@@ -67,30 +67,7 @@ class Worker:
         VinemapError
             That the function raises.
         """
-        message = pickle.dumps((function, args, kwargs))
-        process = self._given(message)
-        expired = threading.Event()
-
-        def expire() -> None:
-            expired.set()
-            process.kill()
-
-        timer = threading.Timer(limit or 0, expire)
-        if limit:
-            timer.start()
-        try:
-            good, value = pickle.loads(_receive(process.stdout))  # noqa: S301 - from a process of ours
-        except EOFError:
-            code = process.wait()
-            reason = f"took longer than {limit:g} s" if expired.is_set() else f"its process died{self._cause(code)}"
-            error = WorkerError(reason)
-            error.heals = code == -signal.SIGKILL and not expired.is_set()
-            raise error from None
-        except BaseException:
-            self.close()
-            raise
-        finally:
-            timer.cancel()
+        good, value = self._reply(self._given(pickle.dumps((function, args, kwargs))), limit)
         if good:
             result: T = value
             return result
@@ -107,10 +84,14 @@ class Worker:
         with self._starting:
             if self._stopped:
                 raise WorkerError("stopped")
-            pipe, self._said = subprocess.PIPE, tempfile.TemporaryFile()  # noqa: SIM115 - closed in close
-            self._process = subprocess.Popen(  # noqa: S603
-                self._command, stdin=pipe, stdout=pipe, stderr=self._said, bufsize=0
-            )
+            pipe = subprocess.PIPE
+            try:
+                self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed in close
+                self._process = subprocess.Popen(  # noqa: S603
+                    self._command, stdin=pipe, stdout=pipe, stderr=self._said, bufsize=0
+                )
+            except OSError as error:
+                raise _healing(f"no process can be started ({error.strerror or error})") from error
 
     def close(self) -> None:
         """End the process, whatever it does; the next call starts another."""
@@ -118,10 +99,10 @@ class Worker:
         if process:
             process.kill()
             process.wait()
-            for stream in (process.stdin, process.stdout, said):
-                if stream:
-                    with contextlib.suppress(OSError):
-                        stream.close()
+        for stream in (process.stdin, process.stdout, said) if process else (said,):
+            if stream:
+                with contextlib.suppress(OSError):
+                    stream.close()
 
     def stop(self) -> None:
         """End the process for good; a call that runs fails, from another thread too."""
@@ -146,8 +127,43 @@ class Worker:
             return process
         raise WorkerError("no process can be started")
 
-    def _cause(self, code: int) -> str:
-        """Of what a process died, by its exit code and what it said last."""
+    def _reply(self, process: subprocess.Popen[bytes], limit: float | None) -> tuple[bool, Any]:
+        """Whether a call went well, and what it gave or raised."""
+        expired = threading.Event()
+
+        def expire() -> None:
+            expired.set()
+            process.kill()
+
+        timer = threading.Timer(limit or 0, expire)
+        if limit:
+            timer.start()
+        try:
+            answer = _receive(process.stdout)
+        except EOFError:
+            code = process.wait()
+            if expired.is_set():
+                raise WorkerError(f"took longer than {limit:g} s") from None
+            raise self._dead(code) from None
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            timer.cancel()
+            if limit:
+                timer.join()
+        if expired.is_set():  # too late for this call, but not for the next
+            self.close()
+        try:
+            good, value = pickle.loads(answer)  # noqa: S301 - from a process of ours
+        except Exception as error:
+            raise WorkerError(f"a fault of vinemap's own (an answer that can't be read: {error})") from error
+        return good, value
+
+    def _dead(self, code: int) -> WorkerError:
+        """What is said of a process that died, by its exit code and what it said last."""
+        if self._stopped:
+            return WorkerError("stopped")
         said: list[bytes] = []
         if self._said:
             self._said.seek(max(0, self._said.seek(0, os.SEEK_END) - 4096))
@@ -158,7 +174,8 @@ class Worker:
             with contextlib.suppress(ValueError):
                 name = signal.Signals(-code).name
                 name = f"{name}, {KILLED[name]}" if name in KILLED else name
-        return f" ({name}){last}"
+        reason = f"its process died ({name}){last}"
+        return _healing(reason) if code == -signal.SIGKILL else WorkerError(reason)
 
 
 class Workers:
@@ -168,9 +185,13 @@ class Workers:
         self.slots = n
         self._all = [Worker(cores=cores, memory=memory) for _ in range(n)]
         self._free: queue.LifoQueue[Worker] = queue.LifoQueue()
-        for worker in self._all:
-            worker.start()
-            self._free.put(worker)
+        try:
+            for worker in self._all:
+                worker.start()
+                self._free.put(worker)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def run(self, function: Callable[..., T], *args: Any, limit: float | None = None, **kwargs: Any) -> T:
         """Run a function as :meth:`Worker.run` does, when one is free."""
@@ -192,6 +213,13 @@ class Workers:
         self.stop()
         for worker in self._all:
             worker.close()
+
+
+def _healing(reason: str) -> WorkerError:
+    """An error of the moment."""
+    error = WorkerError(reason)
+    error.heals = True
+    return error
 
 
 def _send(stream: IO[bytes] | None, message: bytes) -> None:

@@ -1,0 +1,500 @@
+"""Surveys that arrive in a folder: found, told from uploads, and one's fault costing no other."""
+
+import os
+import shutil
+import struct
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import geopandas as gpd
+import laspy
+import numpy as np
+import pytest
+import shapely
+
+from vinemap import estate
+from vinemap.config import EstateConfig, load_estate
+from vinemap.estate import arrivals, unfinished
+from vinemap.las import read_cloud
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="names of files are others here")
+FORMATS = {"las 1.2": (3, "1.2"), "las 1.4": (6, "1.4"), "laz 1.2": (3, "1.2"), "laz 1.4": (7, "1.4")}
+NOW = time.time() + 3600
+"""When files that were just written are long settled."""
+
+
+def points(n, seed=0):
+    return np.random.default_rng(seed).uniform([414_700, 4_940_700, 0], [414_730, 4_940_730, 3], (n, 3))
+
+
+def as_las(n, kind):
+    form, version = FORMATS[kind]
+    header = laspy.LasHeader(point_format=form, version=version)
+    header.scales = np.full(3, 0.001)
+    header.offsets = [414_700, 4_940_700, 0]
+    header.creation_date = datetime(2024, 6, 1, tzinfo=UTC)
+    las = laspy.LasData(header)
+    las.xyz = points(n)
+    return las
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory):
+    """A whole file of each kind."""
+    folder = tmp_path_factory.mktemp("clouds")
+    made = {}
+    for kind in FORMATS:
+        made[kind] = folder / f"{kind}.{kind[:3]}"
+        as_las(2000, kind).write(made[kind])
+    made["evlr"] = folder / "evlr.laz"
+    las = as_las(2000, "laz 1.4")
+    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("vines", 1, "of the survey", bytes(100))])
+    las.write(made["evlr"])
+    made["copc"] = folder / "copc.copc.laz"
+    try:
+        import copclib
+    except ImportError:
+        del made["copc"]
+        return made
+    low = points(2000).min(axis=0)
+    config = copclib.CopcConfigWriter(7, copclib.Vector3(0.001, 0.001, 0.001), copclib.Vector3(*np.floor(low)), "")
+    config.copc_info.halfsize, config.copc_info.spacing = 20, 10
+    writer = copclib.FileWriter(str(made["copc"]), config)
+    for x, chunk in enumerate(np.split(points(2000), 2)):
+        node = copclib.Points(writer.copc_config.las_header)
+        for xyz in chunk:
+            point = node.CreatePoint()
+            point.x, point.y, point.z = xyz
+            node.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(1, x, 0, 0), node)
+    writer.Close()
+    return made
+
+
+class Unseekable:
+    """A stream as a pipe is, into which nothing can be written later."""
+
+    def __init__(self, path):
+        self.stream = path.open("wb")
+
+    def write(self, data):
+        return self.stream.write(data)
+
+    def flush(self):
+        self.stream.flush()
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "in").mkdir()
+    return tmp_path / "in"
+
+
+def found(place, *, now=NOW, **options):
+    return list(arrivals(EstateConfig(surveys=place, **options), now=now))
+
+
+def reasons(place, **options):
+    """What is said of surveys that can't be worked."""
+    return {arrival.name: arrival.reason for arrival in found(place, **options)}
+
+
+def put(cloud, *places):
+    for place in places:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(cloud, place)
+
+
+def polygons(path):
+    gpd.GeoDataFrame({"name": ["A"]}, geometry=[shapely.box(7, 44, 7.1, 44.1)], crs=4326).to_file(path)
+    return path
+
+
+def cuts(whole):
+    """Lengths at which a file is cut: all of its beginning and its end, many between."""
+    near = {*range(700), *range(len(whole) - 300, len(whole))}
+    return sorted(near | set(np.linspace(0, len(whole) - 1, 200).astype(int).tolist()))
+
+
+@pytest.mark.parametrize("kind", [*FORMATS, "evlr", "copc"])
+def test_a_file_that_is_cut_is_unfinished_and_a_whole_one_never(clouds, tmp_path, kind):
+    if kind not in clouds:
+        pytest.skip("needs copclib, which writes COPC files")
+    whole = clouds[kind].read_bytes()
+    assert unfinished(clouds[kind]) == ""
+    path = tmp_path / clouds[kind].name
+    path.write_bytes(whole)
+    slipped = []
+    for n in reversed(cuts(whole)):
+        os.truncate(path, n)
+        if not unfinished(path):
+            slipped.append(len(whole) - n)
+    assert slipped == []
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("n", [0, 1, 120_000])
+def test_few_points_and_many(tmp_path, kind, n):
+    path = tmp_path / f"a.{kind[:3]}"
+    as_las(n, kind).write(path)
+    assert unfinished(path) == ""
+    size = path.stat().st_size
+    for less in (1, 2, 5, 12) if n else ():
+        os.truncate(path, size - less)
+        assert unfinished(path)
+
+
+@pytest.mark.parametrize("kind", ["laz 1.2", "laz 1.4"])
+def test_a_file_whose_writer_could_not_go_back(clouds, tmp_path, kind):
+    """The place of its table of chunks is its last number then, and -1 where it is otherwise."""
+    whole = bytearray(clouds[kind].read_bytes())
+    (offset,) = struct.unpack("<I", whole[96:100])
+    whole += whole[offset : offset + 8]
+    whole[offset : offset + 8] = struct.pack("<q", -1)
+    path = tmp_path / "a.laz"
+    path.write_bytes(whole)
+    assert len(laspy.read(path).points) == 2000
+    assert unfinished(path) == ""
+    slipped = []
+    for n in reversed(cuts(whole)):
+        os.truncate(path, n)
+        if not unfinished(path):
+            slipped.append(len(whole) - n)
+    assert slipped == []
+
+
+@pytest.mark.parametrize("kind", ["las 1.4", "laz 1.4"])
+def test_a_file_of_its_full_length_that_holds_zeros_at_its_end(clouds, tmp_path, kind):
+    """As tools leave it that make room first. Of LAS nothing tells."""
+    whole = clouds[kind].read_bytes()
+    path = tmp_path / "a.laz"
+    for n in (0, 4, 100, 300, 500, 1000, len(whole) // 2, len(whole) - 30):
+        path.write_bytes(whole[:n] + bytes(len(whole) - n))
+        assert bool(unfinished(path)) == (kind.startswith("laz") and n >= 300), n
+
+
+def test_what_is_no_cloud_is_not_called_unfinished(tmp_path):
+    for content in (b"no cloud at all", bytes(1000), b"LASX" * 200):
+        (tmp_path / "a.laz").write_bytes(content)
+        assert unfinished(tmp_path / "a.laz") == ""
+
+
+def test_a_broken_header_is_no_reason_to_break(clouds, tmp_path):
+    """Random bytes in the header of a whole file: something is said, or nothing, but soon."""
+    rng = np.random.default_rng(0)
+    for kind in ("las 1.4", "laz 1.2", "evlr"):
+        whole = bytearray(clouds[kind].read_bytes())
+        path = tmp_path / "a.laz"
+        for _ in range(100):
+            broken = whole.copy()
+            for k in rng.integers(4, 450, 4):
+                broken[k] = rng.integers(256)
+            path.write_bytes(broken)
+            assert isinstance(unfinished(path), str)
+
+
+def test_surveys_are_files_and_folders(clouds, place):
+    put(clouds["laz 1.4"], place / "may.laz", place / "june" / "flight 7.LAZ", place / "july.copc.laz")
+    put(clouds["las 1.2"], place / "Àugust.LAS")
+    polygons(place / "june" / "anything.gpkg")
+    (place / "empty").mkdir()
+    (place / "later").mkdir()
+    polygons(place / "later" / "parcels.gpkg")
+    (place / "notes.txt").touch()
+    surveys = {arrival.name: arrival.config for arrival in found(place)}
+    assert list(surveys) == sorted(surveys) == ["july", "june", "may", "Àugust"]
+    assert all(config.survey == name for name, config in surveys.items())
+    assert surveys["may"].cloud == place / "may.laz"
+    assert surveys["june"].cloud == place / "june" / "flight 7.LAZ"
+    assert surveys["june"].boundaries == place / "june" / "anything.gpkg"
+    assert surveys["may"].boundaries is None
+
+
+@pytest.mark.parametrize("name", [".may.laz", ".may", "may.laz.part", "may.laz.filepart", "may.tmp", "may.zip"])
+def test_what_is_hidden_or_something_else_is_left_out(clouds, place, name):
+    put(clouds["laz 1.4"], place / name / "a.laz" if name == ".may" else place / name)
+    assert found(place) == []
+
+
+def test_hidden_files_of_a_survey_are_left_out(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "._a.laz", place / "may" / ".b.laz.x7Yz")
+    polygons(place / "may" / "parcels.gpkg")
+    polygons(place / "may" / "x.gpkg").rename(place / "may" / ".parcels.gpkg")
+    assert [arrival.reason for arrival in found(place)] == [""]
+
+
+def test_an_upload_waits_until_it_stays_as_it_is(clouds, place):
+    path = place / "may.laz"
+    put(clouds["laz 1.4"], path)
+    changed = path.stat().st_mtime
+    for age, waits in ((0, True), (1, True), (299, True), (301, False), (1e6, False)):
+        (arrival,) = found(place, now=changed + age)
+        assert arrival.waits is waits, age
+        assert bool(arrival.config) is not waits
+    (arrival,) = found(place, now=changed + 20)
+    assert arrival.reason == "changed 20 s ago, waits until 300 s"
+    (arrival,) = found(place, now=changed + 20, settle=10)
+    assert arrival.config
+    (arrival,) = found(place, now=changed, settle=0)
+    assert arrival.config
+
+
+@pytest.mark.parametrize("young", ["a.laz", "parcels.gpkg", "survey.yaml"])
+def test_every_file_of_a_survey_must_stay_as_it_is(clouds, place, young):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    polygons(place / "may" / "parcels.gpkg")
+    (place / "may" / "survey.yaml").write_text("crs: EPSG:32632\n")
+    for path in (place / "may").iterdir():
+        os.utime(path, (NOW - 1000, NOW - 1000))
+    assert found(place)[0].config
+    os.utime(place / "may" / young, (NOW - 10, NOW - 10))
+    (arrival,) = found(place)
+    assert arrival.waits
+    assert arrival.reason == "changed 10 s ago, waits until 300 s"
+
+
+def test_an_upload_that_pauses_waits_for_a_day(clouds, place):
+    path = place / "may.laz"
+    put(clouds["laz 1.4"], path)
+    os.truncate(path, 5000)
+    os.utime(path, (NOW - 1000, NOW - 1000))
+    (arrival,) = found(place)
+    assert (arrival.config, arrival.waits) == (None, True)
+    assert arrival.reason == f"{path}: ends before its table of chunks: is its upload over?"
+    os.utime(path, (NOW - estate.LATE - 1, NOW - estate.LATE - 1))
+    assert not found(place)[0].waits
+
+
+def test_a_clock_that_is_ahead_holds_nothing_up(clouds, place):
+    """A file of the future can't be waited for, but may still be unfinished."""
+    path = place / "may.laz"
+    put(clouds["laz 1.4"], path)
+    os.utime(path, (NOW + 1e6, NOW + 1e6))
+    assert found(place)[0].config
+    os.truncate(path, 5000)
+    os.utime(path, (NOW + 1e6, NOW + 1e6))
+    assert found(place)[0].waits
+
+
+def test_two_clouds(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "b.las")
+    said = f"{place / 'may'}: holds 2 clouds: name one in its survey.yaml, as 'cloud: FILE'"
+    assert reasons(place) == {"may": said}
+    (place / "may" / "survey.yaml").write_text("cloud: a.laz\n")
+    assert found(place)[0].config.cloud == place / "may" / "a.laz"
+
+
+def test_several_files_of_polygons(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    polygons(place / "may" / "north.gpkg")
+    polygons(place / "may" / "south.geojson")
+    said = f"{place / 'may'}: holds 2 files of polygons: name one in its survey.yaml, as 'boundaries: FILE'"
+    assert reasons(place) == {"may": said}
+    polygons(place / "may" / "Parcels.gpkg")
+    assert found(place)[0].config.boundaries == place / "may" / "Parcels.gpkg"
+    polygons(place / "may" / "boundary.shp")
+    assert "holds 2 files" in reasons(place)["may"]
+    (place / "may" / "survey.yaml").write_text("boundaries: south.geojson\n")
+    assert found(place)[0].config.boundaries == place / "may" / "south.geojson"
+
+
+def test_two_of_one_name(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may.laz", place / "june.las", place / "june.copc.laz")
+    first = {arrival.name: arrival for arrival in found(place)}
+    assert first["may"].config.cloud == place / "may" / "a.laz"
+    assert first["may.laz"].reason == f"{place / 'may.laz'} has the name of {place / 'may'}: give it another"
+    assert first["june"].config.cloud == place / "june.copc.laz"
+    assert not first["june.las"].config
+    assert not first["june.las"].waits
+    assert len(first) == 4
+
+
+def test_an_empty_folder_takes_no_name(clouds, place):
+    (place / "may").mkdir()
+    put(clouds["laz 1.4"], place / "may.laz")
+    (arrival,) = found(place)
+    assert arrival.config.cloud == place / "may.laz"
+
+
+@POSIX
+def test_names_composed_and_not_are_the_same(clouds, place):
+    put(clouds["laz 1.4"], place / "Àlba.laz", place / "A\u0300lba.laz")
+    if len(list(place.iterdir())) == 1:
+        pytest.skip("the disk takes them for the same")
+    assert sorted(bool(arrival.config) for arrival in found(place)) == [False, True]
+
+
+@POSIX
+@pytest.mark.parametrize("name", ["-may", "may ", "con", "a:b", "a\nb", "x" * 65, "葡" * 60, b"Nebbiolo \xe0"])
+def test_names_that_files_of_products_cannot_have(clouds, place, name):
+    put(clouds["laz 1.4"], place / (os.fsdecode(name) + ".laz"), place / os.fsdecode(name) / "a.laz", place / "may.laz")
+    bad, worse, good = sorted(found(place), key=lambda arrival: bool(arrival.config))
+    assert good.name == "may"
+    for arrival in (bad, worse):
+        assert "can't name a file" in arrival.reason
+        assert not arrival.waits
+        assert f"{arrival.name} {arrival.reason}".encode()
+
+
+@POSIX
+@pytest.mark.parametrize("kind", ["cloud", "polygons"])
+def test_names_that_are_no_unicode_within_a_survey(clouds, place, kind):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    polygons(place / "may" / "parcels.gpkg")
+    path = place / "may" / ("a.laz" if kind == "cloud" else "parcels.gpkg")
+    path.rename(path.with_name(os.fsdecode(b"Nebbiolo \xe0") + path.suffix))
+    (arrival,) = found(place)
+    assert not arrival.config
+    assert "rename it" in arrival.reason
+    assert arrival.reason.encode()
+
+
+def test_its_own_file(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "raw" / "b.laz")
+    polygons(place / "drawn.gpkg")
+    own = "survey: other\ncloud: raw/b.laz\nboundaries: ../drawn.gpkg\nsettings: {polygon: {c: 9}}\njob: {limit: 60}\n"
+    (place / "may" / "survey.yaml").write_text(own)
+    (arrival,) = found(place)
+    assert arrival.config.survey == arrival.name == "may"
+    assert arrival.config.cloud.samefile(place / "may" / "raw" / "b.laz")
+    assert arrival.config.boundaries.samefile(place / "drawn.gpkg")
+    assert (arrival.config.settings.polygon.c, arrival.config.job.limit) == (9, 60)
+    (place / "may" / "survey.yaml").write_text(f"cloud: {place / 'may' / 'raw' / 'b.laz'}\n")
+    assert found(place)[0].config.cloud == place / "may" / "raw" / "b.laz"
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ("cluod: a.laz", "unknown key cluod: did you mean 'cloud'?"),
+        ("settle: 5", "unknown key settle"),
+        ("cloud: b.laz", "b.laz: no such file"),
+        ("cloud: .", "no such file"),
+        ("cloud: [a.laz]", "no such file"),
+        ('cloud: "a\\0b.laz"', "no such file"),
+        ("cloud: " + "x" * 300, ""),
+        ("boundaries: b.gpkg", "b.gpkg: no such file"),
+        ("- cloud", "holds no keys"),
+        ("just words", "holds no keys"),
+        ("a: [", "no valid YAML"),
+        (b"\xff\xfe\x00", "no valid YAML"),
+        (bytes(100), "no valid YAML"),
+        ("[" * 800, "no valid YAML"),
+        ("settle: " + "9" * 5000, ""),
+        ("&a {settings: *a, overrides: {A: *a}}", ""),
+        ("parcels: 5", "parcels = 5"),
+        ("parcels: [5]", "put it in quotes"),
+        ("overrides: 5", "overrides = 5"),
+        ("settings: {polygon: 5}", "settings.polygon = 5"),
+    ],
+)
+def test_its_own_file_is_wrong(clouds, place, own, said):
+    """Named, and no other survey's concern."""
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "june.laz")
+    (place / "may" / "survey.yaml").write_bytes(own if isinstance(own, bytes) else own.encode())
+    options = {"overrides": {"A": {"origin": [44, 7, 100]}}}
+    path = place.parent / "estate.yaml"
+    path.write_text(f"surveys: {place}\noverrides: {{A: {{origin: [44, 7, 100]}}}}\n")
+    june, may = arrivals(load_estate(path), now=NOW)
+    assert june.config.overrides.keys() == options["overrides"].keys()
+    assert may.config is None
+    assert not may.waits
+    assert str(place / "may") in may.reason
+    assert said in may.reason
+    assert "\n" not in may.reason
+    assert len(may.reason) < 1000
+
+
+def test_a_folder_in_the_place_of_its_own_file(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    (place / "may" / "survey.yaml").mkdir()
+    assert found(place)[0].config
+
+
+def test_its_own_file_alone(place):
+    (place / "may").mkdir()
+    (place / "may" / "survey.yaml").touch()
+    assert reasons(place) == {"may": f"{place / 'may'}: holds no cloud, and its survey.yaml names none"}
+
+
+def test_what_holds_for_all_surveys(clouds, place):
+    put(clouds["laz 1.4"], place / "may.laz", place / "june" / "a.laz", place / "july" / "a.laz")
+    polygons(place / "july" / "own.gpkg")
+    shared = polygons(place.parent / "shared.gpkg")
+    (place / "june" / "survey.yaml").write_text("parcels: [A]\ncrs: EPSG:32633\n")
+    path = place.parent / "estate.yaml"
+    path.write_text(
+        f"surveys: {place}\nboundaries: {shared}\ncrs: EPSG:32632\nsettings: {{polygon: {{c: 9}}}}\n"
+        "overrides: {A: {settings: {fit: {smoothing: 5}}}, B: {origin: [44, 7, 100]}}\n"
+    )
+    july, june, may = (arrival.config for arrival in arrivals(load_estate(path), now=NOW))
+    assert july.boundaries == place / "july" / "own.gpkg"
+    assert may.boundaries == june.boundaries == shared
+    assert (may.crs, june.crs) == ("EPSG:32632", "EPSG:32633")
+    assert list(june.overrides) == ["A"]
+    assert list(may.overrides) == ["A", "B"]
+    own = june.of_parcel("A").settings
+    assert (own.polygon.c, own.fit.smoothing) == (9, 5)
+
+
+@POSIX
+def test_links(clouds, place):
+    put(clouds["laz 1.4"], place.parent / "disk" / "a.laz")
+    (place / "may.laz").symlink_to(place.parent / "disk" / "a.laz")
+    (place / "june").symlink_to(place.parent / "disk")
+    (place / "gone.laz").symlink_to("nowhere")
+    (place / "loop.laz").symlink_to("loop.laz")
+    os.mkfifo(place / "pipe.laz")
+    surveys = {arrival.name: arrival for arrival in found(place)}
+    assert surveys["may"].config.cloud == place / "may.laz"
+    assert surveys["june"].config.cloud == place / "june" / "a.laz"
+    for name in ("gone.laz", "loop.laz", "pipe.laz"):
+        assert surveys[name].config is None
+        assert "can't be read" in surveys[name].reason
+
+
+@pytest.mark.parametrize("what", ["folder", "cloud"])
+def test_no_permission(clouds, place, monkeypatch, what):
+    """That of one survey costs no other."""
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "june.laz")
+    (method, denied) = ("iterdir", place / "may") if what == "folder" else ("open", place / "may" / "a.laz")
+    original = getattr(Path, method)
+
+    def guarded(path, *words, **options):
+        if path == denied:
+            raise PermissionError(13, "Permission denied")
+        return original(path, *words, **options)
+
+    monkeypatch.setattr(Path, method, guarded)
+    june, may = found(place)
+    assert june.config
+    assert may.config is None
+    assert may.reason == f"{place / 'may'}: can't be read (Permission denied)"
+
+
+def test_a_cloud_that_vanishes_meanwhile(clouds, place, monkeypatch):
+    put(clouds["laz 1.4"], place / "may.laz", place / "june.laz")
+    monkeypatch.setattr(estate, "unfinished", lambda cloud: (_ for _ in ()).throw(FileNotFoundError(2, "gone")))
+    assert [arrival.config for arrival in found(place)] == [None, None]
+
+
+def test_an_empty_estate_and_none(place):
+    assert found(place) == []
+    with pytest.raises(FileNotFoundError):
+        found(place / "none")
+    (place / "file").touch()
+    with pytest.raises(NotADirectoryError):
+        found(place / "file")
+
+
+def test_what_is_found_can_be_read(clouds, place):
+    put(clouds["laz 1.4"], place / "may.laz")
+    (arrival,) = found(place, crs="EPSG:32632")
+    assert read_cloud(arrival.config.cloud, crs=laspy_crs()).size == 2000
+
+
+def laspy_crs():
+    from vinemap.crs import parse_crs
+
+    return parse_crs("EPSG:32632")
