@@ -4,7 +4,6 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
-CONFIG ?= configs/barolo.yaml
 PYTHON ?= python3
 ifndef CLOUD
 tune: CLOUD := data/surveys/barolo/barolo.laz
@@ -18,14 +17,14 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel test check accuracy bench tune clean
+.PHONY: help parcel survey nightly test check accuracy bench tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
 	@sed -nE 's/^([a-z]+):[^#]*## (.*)$$/\1 \2/p' $(firstword $(MAKEFILE_LIST)) | \
 	  while read -r verb does; do printf '  %-8s %s\n' "$$verb" "$$does"; done
 
-parcel: export CONFIG := $(CONFIG)
+parcel: export CONFIG ?= configs/barolo.yaml
 parcel: export PARCEL := $(PARCEL)
 parcel: $(if $(strip $(PARCEL)),$(READY)) ## Map one parcel: make parcel PARCEL=F [CONFIG=configs/barolo.yaml]
 ifeq ($(strip $(PARCEL)),)
@@ -33,6 +32,18 @@ ifeq ($(strip $(PARCEL)),)
 else
 	@$(BIN)/python -m flows.parcel "$$CONFIG" "$$PARCEL"
 endif
+
+survey: export SURVEY := $(SURVEY)
+survey: $(if $(strip $(SURVEY)),$(READY)) ## Map all parcels of a survey that need it: make survey SURVEY=barolo [AGAIN=1]
+ifeq ($(strip $(SURVEY)),)
+	@echo "Name the survey, for example: make survey SURVEY=barolo" >&2; exit 2
+else
+	@$(BIN)/python -m flows.survey "$$SURVEY" $(if $(AGAIN),--again)
+endif
+
+nightly: export CONFIG ?= configs/nightly.yaml
+nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=configs/nightly.yaml]
+	@exec $(BIN)/python -m flows.nightly "$$CONFIG" --serve
 
 test: $(READY) ## Run the tests
 	@$(BIN)/python -m pytest

@@ -14,10 +14,11 @@ from prefect import State, flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 from prefect.states import Completed, Failed
 
+from flows.serving import serve
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap.cli import plain_errors
-from vinemap.config import EstateConfig, load_estate
-from vinemap.errors import BusyError, InputError, VinemapError
+from vinemap.config import load_estate
+from vinemap.errors import BusyError, VinemapError
 from vinemap.estate import Arrival, arrivals
 from vinemap.survey import FAILED, Outcome, plan_survey
 
@@ -49,7 +50,7 @@ def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
     log = get_run_logger()
     estate = load_estate(Path(config))
     nights = []
-    for arrival in _arrivals(estate):
+    for arrival in arrivals(estate):
         night = _survey(arrival, estate.products / arrival.name)
         nights.append(night)
         if night.reason:
@@ -61,13 +62,6 @@ def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
         message = f"{len(failed)} of {len(nights)} surveys failed, or parcels of theirs: {', '.join(failed)[:200]}"
         return Failed(message=message, data=nights)
     return Completed(message=f"{len(nights)} surveys", data=nights)
-
-
-def _arrivals(estate: EstateConfig) -> list[Arrival]:
-    try:
-        return list(arrivals(estate))
-    except OSError as error:
-        raise InputError(f"{estate.surveys}: can't be read ({error.strerror}): make it, or name another") from error
 
 
 def _survey(arrival: Arrival, folder: Path) -> Night:
@@ -86,9 +80,15 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("config", default="configs/nightly.yaml")
-def command(config: str) -> None:
+@click.option("--serve", "served", is_flag=True, help="Stay, and do it when CONFIG says.")
+@click.option("--every", type=click.FloatRange(1), help="Seconds from run to run, instead of CONFIG's cron.")
+def command(config: str, served: bool, every: float | None) -> None:
     """Map the parcels of all surveys that need it; exit code 1 if one of them fails."""
-    load_estate(Path(config))
+    estate = load_estate(Path(config))
+    if served:
+        given = {"config": config}
+        serve("flows.nightly.nightly", parameters=given, cron=estate.cron, timezone=estate.timezone, every=every)
+        return
     state = nightly(config, return_state=True)
     nights: Any = state.result(raise_on_failure=False)
     if isinstance(nights, Exception):

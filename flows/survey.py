@@ -18,8 +18,9 @@ from prefect.states import Completed, Failed
 from flows.parcel import ensure_cloud
 from vinemap import paths
 from vinemap.cli import plain_errors
-from vinemap.config import SurveyConfig, load_survey
+from vinemap.config import SurveyConfig, load_estate, load_survey
 from vinemap.errors import ConfigError, VinemapError
+from vinemap.estate import arrivals
 from vinemap.survey import FAILED, Outcome, map_survey
 
 if TYPE_CHECKING:
@@ -104,19 +105,50 @@ def outcomes_of(config: SurveyConfig, folder: Path, *, again: bool = False) -> l
     return list(outcomes)
 
 
+def chosen(survey: str) -> tuple[SurveyConfig, Path]:
+    """Configuration of a survey and the folder of its products, by the name of a file or of what has arrived.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such survey.
+    """
+    path = Path(survey) if survey.endswith((".yaml", ".yml")) else paths.configuration(survey)
+    if path.is_file() or not paths.ESTATE.is_file():
+        config = load_survey(path)
+        return config, paths.survey_products(config.survey)
+    estate = load_estate(paths.ESTATE)
+    found = {arrival.name: arrival for arrival in arrivals(estate)}
+    if survey not in found:
+        raise ConfigError(f"{path}: no such file, and nothing of that name in {estate.surveys}")
+    arrival = found[survey]
+    if not arrival.config:
+        raise ConfigError(f"{survey}: {arrival.reason}")
+    return arrival.config, estate.products / survey
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("survey")
+@click.option("--again", is_flag=True, help="Map parcels that are up to date, too.")
+def command(survey: str, again: bool) -> None:
+    """Map the parcels of SURVEY that need it: a configuration, or what has arrived under that name.
+
+    The exit code is 1 if one of them fails.
+    """
+    config, folder = chosen(survey)
+    ensure_cloud(config)
+    outcomes = outcomes_of(config, folder, again=again)
+    show(COLUMNS, rows_of(outcomes))
+    failed = sum(outcome.state == FAILED for outcome in outcomes)
+    if failed:
+        click.echo(f"vinemap: {failed} of {len(outcomes)} parcels failed", err=True)
+        sys.exit(1)
+
+
 def main() -> None:
-    """Map the survey whose configuration is named on the command line."""
+    """Run the command line."""
     with plain_errors():
-        if len(sys.argv) != 2:
-            raise ConfigError("give a survey's configuration: python -m flows.survey configs/barolo.yaml")
-        config = load_survey(Path(sys.argv[1]))
-        ensure_cloud(config)
-        outcomes = outcomes_of(config, paths.survey_products(config.survey))
-        show(COLUMNS, rows_of(outcomes))
-        failed = sum(outcome.state == FAILED for outcome in outcomes)
-        if failed:
-            click.echo(f"vinemap: {failed} of {len(outcomes)} parcels failed", err=True)
-            sys.exit(1)
+        command.main(prog_name="python -m flows.survey", standalone_mode=False)
 
 
 if __name__ == "__main__":

@@ -83,3 +83,68 @@ def test_error_in_a_stage_is_one_line(place):
     assert "broken.laz" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (place / "data" / "products" / "broken" / "A").exists()
+
+
+SEEN = """
+import flows, asyncio, json, sys
+from prefect import get_client
+from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterKey
+import flows.survey
+
+async def seen():
+    async with get_client() as client:
+        tasks = [(r.name, r.state_name, r.run_count) for r in await client.read_task_runs()]
+        chosen = ArtifactFilter(key=ArtifactFilterKey(any_=["survey"]))
+        tables = [json.loads(a.data) for a in await client.read_artifacts(artifact_filter=chosen)]
+        flows = [(r.state_name, r.state.message) for r in await client.read_flow_runs()]
+        return {"tasks": sorted(tasks), "tables": tables, "flows": flows}
+
+def show():
+    print(json.dumps(asyncio.run(seen())))
+"""
+
+
+def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
+    """Of two parcels in the same polygon, one with an origin that lies elsewhere."""
+    (place / "two.yaml").write_text("survey: small\nparcels: [B, C]\noverrides: {C: {origin: [0, 0, 0]}}\n")
+    shutil.rmtree(place / "prefect", ignore_errors=True)
+    done = flow(place, code=SEEN + "sys.argv[1:] = ['two.yaml']\ntry:\n    flows.survey.main()\nfinally:\n    show()")
+    assert done.returncode == 1
+    assert done.stderr == "vinemap: 1 of 2 parcels failed\n"
+    head, first, second, told = done.stdout.strip().split("\n")
+    assert head.split() == ["parcel", "rows", "seconds", "state", "reason"]
+    assert first.split()[:2] == ["B", "6"]
+    assert first.split()[-1] == "done"
+    assert "failed  origin 0, 0 is over 50 km from the cloud" in second
+    seen = json.loads(told)
+    assert seen["tasks"] == [["B", "Completed", 1], ["C", "Failed", 1]]
+    assert seen["flows"] == [["Failed", "1 of 2 parcels failed: C"]]
+    (table,) = seen["tables"]
+    assert [(row["parcel"], row["state"]) for row in table] == [("B", "done"), ("C", "failed")]
+
+
+def test_only_what_may_heal_is_tried_again(place):
+    code = SEEN + (
+        "from prefect import flow\n"
+        "from vinemap.errors import BusyError, InputError\n"
+        "flows.survey.RETRIES = (0.1, 0.2, 0.3)\n"
+        "calls = []\n"
+        "def work(name, error, times):\n"
+        "    calls.append(name)\n"
+        "    if calls.count(name) <= times:\n"
+        "        raise error(name)\n"
+        "    return name.upper()\n"
+        "@flow\n"
+        "def job():\n"
+        "    given = flows.survey.as_task('busy', work, 'busy', BusyError, 2)\n"
+        "    for name, error in (('bad', InputError), ('stuck', BusyError)):\n"
+        "        try:\n"
+        "            flows.survey.as_task(name, work, name, error, 9)\n"
+        "        except error:\n"
+        "            calls.append('failed')\n"
+        "    return given\n"
+        "print(job(), ' '.join(calls))\n"
+    )
+    done = flow(place, code=code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "BUSY busy busy busy bad failed stuck stuck stuck stuck failed\n"

@@ -59,6 +59,7 @@ MAY_IMPORT = {
     "workers": BASE,
     "dask_engine": BASE | {"workers"},
     "survey": CHAIN | {"parcel", "recipe", "stac", "store", "workers", "dask_engine"},
+    "estate": CHAIN,
     "canopy_accuracy": CHAIN | {"parcel"},
     "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
     "bench_jobs": CHAIN | {"parcel"},
@@ -66,7 +67,7 @@ MAY_IMPORT = {
     "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel", "survey", "template"},
     "__main__": {"cli"},
-    "flows": CHAIN | {"parcel", "cli", "flows"},
+    "flows": CHAIN | {"parcel", "survey", "estate", "processes", "cli", "flows"},
 }
 
 

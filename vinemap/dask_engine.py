@@ -6,7 +6,7 @@ import threading
 from typing import TYPE_CHECKING, Any, Self
 
 from vinemap import machine
-from vinemap.errors import DependencyError, InputError, WorkerError
+from vinemap.errors import ConfigError, DependencyError, WorkerError
 from vinemap.workers import Worker
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class DaskWorkers:
     ------
     DependencyError
         If Dask isn't installed.
-    InputError
+    ConfigError
         If no scheduler or no worker answers there.
     """
 
@@ -48,12 +48,12 @@ class DaskWorkers:
         try:
             self._client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise InputError(f"no Dask scheduler answers at {scheduler}: is that its address?") from error
+            raise ConfigError(f"no Dask scheduler answers at {scheduler}: is that its address?") from error
         try:
             self._client.wait_for_workers(1, timeout=PATIENCE)
         except TimeoutError as error:
             self._client.close()
-            raise InputError(f"the Dask scheduler at {scheduler} has no workers: start some there") from error
+            raise ConfigError(f"the Dask scheduler at {scheduler} has no workers: start some there") from error
         self._memory = int(memory * 1e9) if memory else None
         self.slots = min(MOST_SLOTS, sum(self._client.nthreads().values()))
 

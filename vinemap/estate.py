@@ -62,11 +62,15 @@ def arrivals(estate: EstateConfig, *, now: float | None = None) -> Iterator[Arri
 
     Raises
     ------
-    OSError
+    InputError
         If the folder can't be read.
     """
     seen: dict[str, Path] = {}
-    for path in sorted(estate.surveys.iterdir()):
+    try:
+        found = sorted(estate.surveys.iterdir())
+    except OSError as error:
+        raise InputError(f"{estate.surveys}: can't be read ({error.strerror}): make it, or name another") from error
+    for path in found:
         if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in CLOUDS):
             continue
         name = path.name if path.is_dir() else path.stem.removesuffix(".copc")

@@ -10,11 +10,18 @@ DATA = Path("data")
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
+ESTATE = Path("configs/nightly.yaml")
+"""Configuration of the estate whose surveys come night after night."""
 
 
 def stem(cloud: Path) -> str:
     """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
     return re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))[:64] or "cloud"
+
+
+def configuration(survey: str) -> Path:
+    """Configuration of a survey."""
+    return Path("configs") / f"{survey}.yaml"
 
 
 def shown(path: Path | str) -> str:
@@ -35,6 +42,11 @@ def survey_boundaries(survey: str) -> Path:
 def survey_products(survey: str) -> Path:
     """Folder of the products of a survey's parcels."""
     return DATA / "products" / survey
+
+
+def prefect_home() -> Path:
+    """Folder of the Prefect server that runs flows on a schedule: its database and its log."""
+    return DATA / ".prefect"
 
 
 def product_folder(survey: str, parcel: str) -> Path:

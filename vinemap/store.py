@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import os
 import re
@@ -22,6 +23,7 @@ from vinemap.errors import BusyError, OutputError, VinemapError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+FULL = {errno.ENOSPC, errno.EDQUOT}
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of Linux's renameat2(2)."""
 PART = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
@@ -128,7 +130,8 @@ def write_whole(path: Path, text: str) -> None:
 
 def unwritable(place: Path, error: OSError) -> OutputError:
     """What is said of a folder in which nothing can be written."""
-    return OutputError(f"{place}: can't be written ({error.strerror or error}): choose another folder")
+    advice = "make room there" if error.errno in FULL else "choose another folder"
+    return OutputError(f"{place}: can't be written ({error.strerror or error}): {advice}")
 
 
 @contextmanager

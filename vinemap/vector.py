@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import errno
 import os
+import shutil
 import unicodedata
 import warnings
 from datetime import UTC, datetime
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
+SMALLEST = 1 << 20
+"""Bytes that a GeoPackage needs: with fewer on the disk, SQLite fails in many ways."""
 PARCEL_LAYER = "parcel"
 NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
 TEXT, WHOLE, REAL = "str", "int64", "float64"
@@ -116,9 +119,9 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date
     try:
         _write_layers(layers, path)
     except (DataSourceError, DataLayerError, FeatureError) as error:
-        if "full" in str(error):
+        if "full" in str(error) or shutil.disk_usage(path.parent).free < SMALLEST:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
-        raise OSError(f"GeoPackage: {' '.join(str(error).split())}") from error
+        raise OSError(f"GeoPackage: {' '.join(str(error).partition(': sqlite3')[0].split())}") from error
     finally:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 

@@ -31,7 +31,6 @@ class Zones(NamedTuple):
     """Polygons, and a raster (ny, nx) that tells of its cells which polygon covers them."""
 
     polygons: Sequence[shapely.Geometry]
-    tree: shapely.STRtree
     grid: Grid
     code: Labels
 
@@ -57,7 +56,7 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
         here = code[where]
         here[inside] = np.where(here[inside] == NOWHERE, k, ASK)
         here[edge] = ASK
-    return Zones(polygons, shapely.STRtree(polygons), grid, code)
+    return Zones(polygons, grid, code)
 
 
 def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
@@ -74,12 +73,27 @@ def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
     _look_up(xyz, zones.grid, zones.code, label)
     asked = np.flatnonzero(label == ASK)
     label[asked] = NOWHERE
-    p, k = zones.tree.query(shapely.points(xyz[asked, :2]), predicate="within")
+    p, k = _ask(xyz[asked], zones.polygons)
     order = np.lexsort((k, p))
-    p, k = asked[p[order]], k[order].astype(np.int32)
+    p, k = asked[p[order]], k[order]
     first = np.diff(p, prepend=-1) > 0
     label[p[first]] = k[first]
     return _gather(xyz, label, p[~first], k[~first], len(zones.polygons))
+
+
+def _ask(xyz: Points, polygons: Sequence[shapely.Geometry]) -> tuple[Indices, Labels]:
+    """Points (n, 3) and the polygons that hold them, pair by pair; eastwards, so that each polygon asks few points."""
+    eastwards = np.argsort(xyz[:, 0])
+    x, y = xyz[eastwards, 0], xyz[eastwards, 1]
+    west, south, east, north = shapely.bounds(np.array(polygons)).T
+    first, last = np.searchsorted(x, west, side="left"), np.searchsorted(x, east, side="right")
+    points, labels = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int32)]
+    for k in np.flatnonzero(first < last).tolist():
+        near = first[k] + np.flatnonzero((y[first[k] : last[k]] >= south[k]) & (y[first[k] : last[k]] <= north[k]))
+        inside = near[shapely.contains_xy(polygons[k], x[near], y[near])]
+        points.append(eastwards[inside])
+        labels.append(np.full(len(inside), k, dtype=np.int32))
+    return np.concatenate(points), np.concatenate(labels)
 
 
 @compiled

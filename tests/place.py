@@ -1,0 +1,105 @@
+"""A folder from which schedules are run on a Prefect server of its own, on loopback."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.request import Request, urlopen
+
+from vinemap.processes import descendants
+
+ROOT = Path(__file__).parents[1]
+SERVE = """
+import json, sys
+from flows.serving import serve
+from vinemap.cli import plain_errors
+with plain_errors():
+    serve("job.job", **json.loads(sys.argv[1]))
+"""
+
+
+def wait(condition, *, patience=120):
+    """Return what a condition gives as soon as that is true."""
+    deadline = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it never came true"
+        time.sleep(0.1)
+    return found
+
+
+def gone(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+class Place:
+    """A folder from which schedules are run on a port of their own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        with socket.create_server(("127.0.0.1", 0)) as one:
+            self.port = one.getsockname()[1]
+        self.api = f"http://127.0.0.1:{self.port}/api"
+        kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
+        self.environment = kept | {
+            "PYTHONPATH": f"{ROOT}:{folder}",
+            "PREFECT_API_URL": self.api,
+            "PREFECT_RUNNER_POLL_FREQUENCY": "1",
+            "PREFECT_SERVER_SERVICES_SCHEDULER_RECENT_DEPLOYMENTS_LOOP_SECONDS": "1",
+            "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+            "DO_NOT_TRACK": "1",
+        }
+
+    def start(self, said, *command, **options):
+        """Start a command, or the flow ``job`` on a schedule."""
+        command = command or ("-c", SERVE, json.dumps({"parameters": {}} | options))
+        return subprocess.Popen(
+            [sys.executable, *command], cwd=self.folder, env=self.environment, stdout=said, stderr=subprocess.STDOUT
+        )
+
+    def fails(self, **options):
+        with (self.folder / "failed.txt").open("w+b") as said:
+            process = self.start(said, **options)
+            assert process.wait(60) == 2
+            said.seek(0)
+            return said.read().decode()
+
+    @contextmanager
+    def serving(self, *command, **options):
+        """Give a process that serves, and what it says; nothing of it is left."""
+        path = self.folder / "said.txt"
+        with path.open("wb") as said, self.start(said, *command, **options) as process:
+            try:
+                while "Next run" not in path.read_text():
+                    assert process.poll() is None, path.read_text()
+                    time.sleep(0.1)
+                yield process, path
+            finally:
+                processes = [process.pid, *descendants(process.pid)]
+                process.terminate()
+                try:
+                    process.wait(60)
+                finally:
+                    process.kill()
+                wait(lambda: all(map(gone, processes)))
+
+    def ask(self, path, body):
+        request = Request(self.api + path, json.dumps(body).encode(), {"Content-Type": "application/json"})
+        with urlopen(request, timeout=30) as answer:
+            return json.load(answer)
+
+    def runs(self, state=None):
+        chosen = {"flow_runs": {"state": {"type": {"any_": [state]}}}} if state else {}
+        return self.ask("/flow_runs/filter", chosen | {"sort": "EXPECTED_START_TIME_ASC"})
+
+    def prefect(self, *args, cwd):
+        command = [sys.executable, "-m", "prefect", *args]
+        environment = self.environment | {"PREFECT_HOME": str(self.folder / "client")}
+        options = {"cwd": cwd, "env": environment, "stdin": subprocess.DEVNULL, "timeout": 120}
+        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
