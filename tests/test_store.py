@@ -317,6 +317,20 @@ def test_never_two_at_once(tmp_path):
     assert names(tmp_path) == ["F"]
 
 
+def test_a_lock_is_removed_while_it_is_held(tmp_path, monkeypatch):
+    """Later it could be another's."""
+    held = []
+
+    class Watched(store.FileLock):
+        def release(self, *words, **options):
+            held.append(Path(self.lock_file).exists())
+            super().release(*words, **options)
+
+    monkeypatch.setattr(store, "FileLock", Watched)
+    publish(tmp_path / "F")
+    assert set(held) == {False}
+
+
 HOLD = """
 import sys
 from pathlib import Path
