@@ -47,7 +47,7 @@ MAY_IMPORT = {
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
     "scenes": BASE | {"synthetic"},
     "settings": set(),
-    "config": BASE | {"settings"},
+    "config": BASE | {"settings", "paths"},
     "template": {"settings", "config"},
     "paths": set(),
     "store": {"errors", "paths"},
