@@ -121,7 +121,7 @@ def test_imports_go_one_way(path):
         ("if TYPE_CHECKING:\n    from vinemap.row_field import RowField", "mesh", ["row_field"]),
         ("def f():\n    from vinemap.config import Config", "curves", ["config"]),
         ("from vinemap.config import Config\nfrom vinemap import paths", "parcel", []),
-        ("from vinemap.paths import product", "config", ["paths"]),
+        ("from vinemap.parcel import follow", "config", ["parcel"]),
         ("from vinemap.raster import Raster", "synthetic", ["raster"]),
         ("from vinemap.scenes import rows_of", "synthetic", ["scenes"]),
         ("from vinemap.synthetic import simulate", "scenes", []),
