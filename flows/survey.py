@@ -69,6 +69,8 @@ def survey_flow(config: SurveyConfig, folder: Path, *, again: bool = False) -> S
     for outcome in map_survey(config, folder, again=again, step=as_task):
         outcomes.append(outcome)
         (log.error if outcome.state == FAILED else log.info)(outcome.line())
+        if sys.stderr.isatty():
+            click.echo(outcome.line(), err=True)
     outcomes.sort(key=lambda outcome: outcome.parcel)
     create_table_artifact([dict(zip(COLUMNS, row, strict=True)) for row in rows_of(outcomes)], key="survey")
     failed = [outcome.parcel for outcome in outcomes if outcome.state == FAILED]

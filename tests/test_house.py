@@ -67,7 +67,7 @@ MAY_IMPORT = {
     "tune": CHAIN | {"parcel", "cli"},
     "cli": CHAIN | {"parcel", "survey", "template"},
     "__main__": {"cli"},
-    "flows": CHAIN | {"parcel", "survey", "estate", "processes", "cli", "flows"},
+    "flows": CHAIN | {"parcel", "recipe", "survey", "estate", "processes", "cli", "flows"},
 }
 
 
