@@ -76,7 +76,9 @@ class JobOptions(Options):
 
     engine: Literal["processes", "dask"] = Field("processes", description="processes here, or a Dask cluster's workers")
     scheduler: str | None = Field(None, description="address of the Dask scheduler, as tcp://host:8786")
-    workers: int | None = Field(None, ge=1, le=10_000, description="parcels worked at once; none: the cores' number")
+    workers: int | None = Field(
+        None, ge=1, le=10_000, description="parcels worked at once; none: as cores and memory allow"
+    )
     limit: float = Field(3600, gt=0, le=1_000_000, description="seconds that a parcel may take")
     memory: float | None = Field(
         None, ge=0.5, le=100_000, description="memory that a parcel may take (GB); none: its share of what there is"

@@ -21,14 +21,16 @@ from vinemap.parcel import Summary, call, follow, found
 from vinemap.pieces import split_cloud
 from vinemap.recipe import Recipe, Source, flown, product_in, read_source
 from vinemap.stac import write_collection
-from vinemap.store import workshop, write_whole
+from vinemap.store import unwritable, workshop, write_whole
 from vinemap.vector import read_parcels
 from vinemap.workers import Worker, Workers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from concurrent.futures import Future
     from contextlib import AbstractContextManager
+
+    from pyproj import CRS
 
     from vinemap.config import SurveyConfig
     from vinemap.las import Boundary
@@ -38,6 +40,8 @@ DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "fail
 """What can become of a parcel."""
 MOST_MEMORY = 0.8
 """Share of the memory that a job takes."""
+ROOM = 1.5e9
+"""Bytes that a parcel's process has at the least: on small machines there are fewer."""
 
 
 @dataclass(frozen=True)
@@ -210,13 +214,16 @@ def _engine(plan: Plan, config: SurveyConfig) -> AbstractContextManager[Engine]:
         from vinemap.dask_engine import DaskWorkers
 
         return DaskWorkers(job.scheduler or "", memory=job.memory)
-    n = min(job.workers or machine.cores(), len(plan.recipes))
+    most = min(
+        machine.cores(), max(1, int(MOST_MEMORY * machine.memory() / (1e9 * job.memory if job.memory else ROOM)))
+    )
+    n = min(job.workers or most, len(plan.recipes))
     return Workers(n, cores=max(1, machine.cores() // n), memory=_memory(config, n))
 
 
 def _memory(config: SurveyConfig, n: int) -> int:
     """Bytes that each of n processes may take."""
-    return int(config.job.memory * 1e9) if config.job.memory else int(MOST_MEMORY * machine.memory() / n)
+    return int(config.job.memory * 1e9 if config.job.memory else max(ROOM, MOST_MEMORY * machine.memory() / n))
 
 
 def _work(
@@ -263,7 +270,7 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
     reader = Worker(cores=machine.cores(), memory=_memory(config, 1))
     try:
         boundaries = [recipe.boundary for recipe in together]
-        pieces = reader.run(split_cloud, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
+        pieces = reader.run(_split, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
     except WorkerError as error:
         raise WorkerError(f"{cloud}: can't be read: {error}") from error
     finally:
@@ -280,6 +287,13 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
             yield recipe, piece
 
 
+def _split(cloud: Path, boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None) -> list[Piece | InputError]:
+    try:
+        return split_cloud(cloud, boundaries, aside, crs=crs)
+    except OSError as error:
+        raise unwritable(aside.parent, error) from error
+
+
 def _run(
     recipe: Recipe,
     piece: Piece | None,
@@ -292,7 +306,7 @@ def _run(
     """Have a parcel worked, and tell what became of it."""
     began = time.perf_counter()
     failed = partial(Outcome, recipe.parcel, FAILED, key=recipe.key)
-    options = {"piece": piece, "drafts": aside, "within": folder, "share": 1 / workers.slots, "limit": limit}
+    options = {"piece": piece, "drafts": aside, "within": folder, "limit": limit}
     try:
         summary: Summary = step(recipe.parcel, workers.run, follow, recipe, folder / recipe.parcel, **options)
     except VinemapError as error:
