@@ -192,13 +192,10 @@ def map_survey(
             outcomes += [Outcome(r.parcel, FAILED, reason=str(error), key=r.key) for r in left]
             raise
         finally:
-            _write_record(config, folder, plan, outcomes, began)
-            write_collection(
-                folder,
-                survey=config.survey,
-                flown=flown(plan.sources[0]),
-                sources=[(source.path, source.record()) for source in plan.sources],
-            )
+            if outcomes:
+                _write_record(config, folder, plan, outcomes, began)
+                known = [(source.path, source.record()) for source in plan.sources]
+                write_collection(folder, survey=config.survey, flown=flown(plan.sources[0]), sources=known)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
