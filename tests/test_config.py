@@ -274,8 +274,8 @@ def test_parcels_inherit_what_they_leave_open(write):
     config = load_survey(
         write(
             "survey: x\norigin: [44, 7, 100]\nsettings: {polygon: {c: 9}, fit: {smoothing: 5}}\n"
-            "overrides:\n  A: {settings: {fit: {min_gap: 1}}}\n  C:\n"
-            "  B: {origin: [45, 8, 0], settings: {polygon: {c: 11}}}\n"
+            "overrides:\n  A: {settings: {fit: {min_gap: 1}}}\n"
+            "  B: {origin: [45, 8, 0], settings: {polygon: {c: 11}}}\n  C:\n"
         )
     )
     other, a, b, c = (config.of_parcel(name) for name in ("other", "A", "B", "C"))
@@ -289,8 +289,8 @@ def test_surveys_inherit_what_they_leave_open(write, tmp_path):
     """Estate, survey, parcel: the nearest counts, key by key."""
     estate = load_estate(
         write(
-            "settle: 5\ncrs: EPSG:32632\nsettings: {polygon: {c: 9}, fit: {smoothing: 5}}\n"
-            "job: {limit: 60, workers: 1}\n"
+            "settle: 5\ncrs: EPSG:32632\njob: {limit: 60, workers: 1}\n"
+            "settings: {polygon: {c: 9}, fit: {smoothing: 5}}\n"
             "overrides: {A: {settings: {polygon: {c: 10}}}, e\u0301: {settings: {polygon: {c: 12}}}}\n"
         )
     )

@@ -22,7 +22,7 @@ from vinemap.las import read_cloud
 from vinemap.parcel import map_parcel
 from vinemap.pieces import read_piece, split_cloud
 from vinemap.scenes import hillside, rows_of
-from vinemap.survey import DONE, FAILED, map_survey
+from vinemap.survey import CURRENT, DONE, FAILED, map_survey
 from vinemap.synthetic import Vineyard, simulate, write_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
@@ -162,6 +162,20 @@ def test_whoever_asks_for_no_more_outcomes_stops_the_job(cloud, boundaries, tmp_
     assert first.parcel in done
     assert len(done) < 4
     assert all((folder / name / "run.json").is_file() for name in done)
+
+
+def test_the_longest_names(cloud, tmp_path):
+    """Of two, three and four bytes a letter."""
+    parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
+    names = ["é" * 64, "葡" * 53, "🍇" * 40]
+    gpd.GeoDataFrame({"name": names}, geometry=parcels.geometry, crs=parcels.crs).to_file(tmp_path / "long.gpkg")
+    options = {"boundaries": tmp_path / "long.gpkg", "settings": {"product": {"classified": True}}}
+    outcomes = list(job(cloud, tmp_path / "out", **options))
+    assert {outcome.parcel: outcome.state for outcome in outcomes} == dict.fromkeys(names, DONE)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([*names, *SURVEYS])
+    for name in names:
+        assert len(gpd.read_file(paths.geopackage(tmp_path / "out" / name, name), layer="rows")) > 0
+    assert {outcome.state for outcome in job(cloud, tmp_path / "out", **options)} == {CURRENT}
 
 
 @pytest.mark.parametrize("most", [np.inf, 1000])

@@ -144,8 +144,17 @@ def _topocentric(origin: Origin) -> Transformer:
 
 
 def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geometry:
-    """Bring a geometry, in two dimensions, from one CRS to another."""
-    convert = transformer(horizontal(source), target).transform
+    """Bring a geometry, in two dimensions, from one CRS to another.
+
+    Raises
+    ------
+    InputError
+        If nothing leads from one to the other.
+    """
+    try:
+        convert = transformer(horizontal(source), target).transform
+    except ProjError as error:
+        raise InputError(f"polygons in {source.name} can't be brought to {target.name}: check their CRS") from error
     return shapely.transform(shapely.force_2d(polygon), lambda xy: np.column_stack(convert(*xy.T)))
 
 

@@ -19,6 +19,10 @@ class InputError(VinemapError):
     """A cloud, boundary or reference can't be used as it is."""
 
 
+class OutsideError(InputError):
+    """A cloud has no point in a parcel."""
+
+
 class ConfigError(VinemapError):
     """A configuration has an unknown key, a value out of bounds, or an unknown parcel."""
 

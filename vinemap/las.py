@@ -13,7 +13,7 @@ import shapely
 
 from vinemap.compiled import ahead
 from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
-from vinemap.errors import InputError
+from vinemap.errors import PASSING, BusyError, InputError, OutsideError
 from vinemap.tiles import Collector
 from vinemap.zones import deal, zones_of
 
@@ -41,6 +41,8 @@ LARGEST_RELIEF = 2_000.0
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
 
+DISK = "Failed to use read"
+"""What lazrs says of any fault in reading bytes."""
 OURS = (InputError, KeyboardInterrupt, SystemExit, GeneratorExit)
 """What isn't raised by laspy and lazrs, which raise many kinds: a Rust panic isn't even an Exception."""
 
@@ -310,13 +312,15 @@ def _size(nodes: Iterable[Any]) -> int:
     return sum(node.point_count for node in nodes)
 
 
-def _none_inside(path: Path) -> InputError:
-    return InputError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
+def _none_inside(path: Path) -> OutsideError:
+    return OutsideError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
 
 
-def unreadable(path: Path, error: BaseException) -> InputError:
-    """What is said of a file that laspy, lazrs or PDAL can't read."""
+def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
+    """What is said of a file that laspy, lazrs or PDAL can't read, or its disk can't now."""
     reason = str(error).strip().split("\n")[0] or type(error).__name__
+    if DISK in reason or (isinstance(error, OSError) and error.errno in PASSING):
+        return BusyError(f"{path}: can't be read now ({reason}): try again")
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 from vinemap import __version__, machine, paths
 from vinemap.config import check_name
 from vinemap.crs import parse_crs
-from vinemap.errors import ConfigError, InputError, VinemapError, WorkerError
+from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError
 from vinemap.parcel import Summary, call, follow, found
 from vinemap.pieces import split_cloud
 from vinemap.recipe import Recipe, Source, flown, product_in, read_source
@@ -72,10 +72,18 @@ class Plan(NamedTuple):
     """What is to be done for a survey, and what is settled without."""
 
     sources: tuple[Source, ...]
+    flown: datetime
     recipes: list[Recipe]
     settled: list[Outcome]
     listed: bool
     """Whether somebody has named the parcels, so that each must be in the cloud."""
+
+
+class _Earlier(NamedTuple):
+    """What the last job in a folder has left."""
+
+    sources: list[Source]
+    outcomes: dict[str, Outcome]
 
 
 class Engine(Protocol):
@@ -109,8 +117,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     """
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
-    earlier = _earlier(folder)
-    hashed = [Source(Path(s["path"]), s["sha256"], tuple(s["stamp"]), s["read"]) for s in earlier.get("sources", [])]
+    hashed, known = _earlier(folder)
     polygons: dict[str, Boundary | InputError | None]
     sources: tuple[Source, ...]
     if config.boundaries is None and config.parcels is None and not boundaries.exists():
@@ -118,9 +125,10 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     else:
         sources = read_source(cloud, hashed), read_source(boundaries, hashed)
         polygons = {**read_parcels(boundaries, config.parcels)}
-    failures = {} if again else {one["parcel"]: one for one in earlier.get("parcels", []) if not one["heals"]}
-    crs, date = parse_crs(config.crs) if config.crs else None, flown(sources[0])
-    plan = Plan(sources, [], [], config.parcels is not None)
+    crs, date, listed = parse_crs(config.crs) if config.crs else None, flown(sources[0]), config.parcels is not None
+    plan = Plan(sources, date, [], [], listed)
+    lasting = {FAILED} if listed else {FAILED, OUTSIDE}
+    hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
     for name, polygon in polygons.items():
         try:
             parcel = check_name(name)
@@ -135,10 +143,10 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
         key = recipe.key
         product = None if again else product_in(folder / parcel)
         if product and (product.key, product.parcel) == (key, parcel):
-            known = product.rows, product.length, 0.0, "; ".join(product.warnings)
-            plan.settled.append(Outcome(parcel, CURRENT, *known, key=key))
-        elif failures.get(parcel, {}).get("key") == key:
-            plan.settled.append(Outcome(**failures[parcel]))
+            numbers = product.rows, product.length, 0.0
+            plan.settled.append(Outcome(parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key))
+        elif parcel in hopeless and hopeless[parcel].key == key:
+            plan.settled.append(hopeless[parcel])
         else:
             plan.recipes.append(recipe)
     return plan
@@ -194,8 +202,8 @@ def map_survey(
         finally:
             if outcomes:
                 _write_record(config, folder, plan, outcomes, began)
-                known = [(source.path, source.record()) for source in plan.sources]
-                write_collection(folder, survey=config.survey, flown=flown(plan.sources[0]), sources=known)
+                given = [(source.path, source.record()) for source in plan.sources]
+                write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
@@ -240,7 +248,7 @@ def _work(
                     if isinstance(piece, Outcome):
                         yield piece
                         continue
-                    run = partial(_run, recipe, piece, folder, aside, config.job.limit, workers, step)
+                    run = partial(_run, recipe, piece, plan, folder, aside, config.job.limit, workers, step)
                     waiting.add(threads.submit(contextvars.copy_context().run, run))
                 if not waiting:
                     break
@@ -294,6 +302,7 @@ def _split(cloud: Path, boundaries: Sequence[Boundary], aside: Path, *, crs: CRS
 def _run(
     recipe: Recipe,
     piece: Piece | None,
+    plan: Plan,
     folder: Path,
     aside: Path,
     limit: float,
@@ -306,6 +315,8 @@ def _run(
     options = {"piece": piece, "drafts": aside, "within": folder, "limit": limit}
     try:
         summary: Summary = step(recipe.parcel, workers.run, follow, recipe, folder / recipe.parcel, **options)
+    except OutsideError as error:
+        return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
     except VinemapError as error:
         known = isinstance(error, (InputError, ConfigError))
         return failed(seconds=time.perf_counter() - began, reason=str(error), heals=not known)
@@ -318,26 +329,28 @@ def _run(
     return Outcome(recipe.parcel, DONE, *numbers, reason="; ".join(summary.warnings), key=recipe.key)
 
 
-def _earlier(folder: Path) -> dict[str, Any]:
+def _earlier(folder: Path) -> _Earlier:
     """What the last job in a folder has left, if it can be read."""
     try:
-        record: dict[str, Any] = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
-        [Outcome(**one) for one in record["parcels"]]
-        [(s["path"], s["sha256"], tuple(s["stamp"]), s["read"]) for s in record["sources"]]
+        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
+        sources = [
+            Source(Path(s["path"]), str(s["sha256"]), tuple(s["stamp"]), float(s["read"])) for s in record["sources"]
+        ]
+        outcomes = {one["parcel"]: Outcome(**one) for one in record["parcels"] if isinstance(one["parcel"], str)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
-    return record
+        return _Earlier([], {})
+    return _Earlier(sources, outcomes)
 
 
 def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list[Outcome], began: datetime) -> None:
-    parcels = {one["parcel"]: one for one in _earlier(folder).get("parcels", [])} if plan.listed else {}
-    parcels |= {o.parcel: asdict(replace(o, state=DONE if o.state == CURRENT else o.state)) for o in outcomes}
+    known = _earlier(folder).outcomes if plan.listed else {}
+    known |= {o.parcel: replace(o, state=DONE if o.state == CURRENT else o.state) for o in outcomes}
     record = {
         "vinemap": __version__,
         "survey": config.survey,
         "began": began.isoformat(timespec="seconds"),
         "seconds": round((datetime.now(UTC) - began).total_seconds(), 3),
         "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
-        "parcels": [parcels[name] for name in sorted(parcels)],
+        "parcels": [asdict(known[name]) for name in sorted(known)],
     }
     write_whole(paths.survey_record(folder), json.dumps(record, indent=2, ensure_ascii=False))
