@@ -29,7 +29,7 @@ from vinemap.vector import read_boundary
 
 SURVEYS = ["collection.json", "survey.json", "three_stac.json"]
 """Files of a survey, beside the folders of its products."""
-KILLS = int(os.environ.get("VINEMAP_KILLS", "3"))
+KILLS = int(os.environ.get("VINEMAP_KILLS", "2"))
 """Instants at which a job is killed."""
 VINEMAP = [sys.executable, "-m", "vinemap.cli"]
 

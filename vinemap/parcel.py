@@ -191,6 +191,8 @@ def map_parcel(
         If the input can't be used or the product can't be written.
     """
     name = check_name(parcel)
+    if settings:
+        check_engine(settings.ground.engine)
     recipe = recipe_of(cloud, parcel=name, named=named, boundary=boundary, settings=settings, crs=crs, origin=origin)
     return follow(recipe, folder, step=step)
 
