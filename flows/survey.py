@@ -21,7 +21,8 @@ from vinemap.cli import plain_errors
 from vinemap.config import SurveyConfig, load_estate, load_survey
 from vinemap.errors import ConfigError, VinemapError
 from vinemap.estate import arrivals
-from vinemap.survey import FAILED, Outcome, map_survey
+from vinemap.plan import FAILED, Outcome
+from vinemap.survey import map_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

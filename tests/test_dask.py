@@ -15,7 +15,8 @@ from vinemap import survey
 from vinemap.config import survey_config
 from vinemap.errors import ConfigError
 from vinemap.parcel import follow
-from vinemap.survey import DONE, map_survey
+from vinemap.plan import DONE
+from vinemap.survey import map_survey
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'vinemap[dask]'")
 

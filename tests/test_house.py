@@ -58,16 +58,17 @@ MAY_IMPORT = {
     "parcel": CHAIN | {"product", "recipe", "notices", "store", "stac"},
     "workers": BASE,
     "dask_engine": BASE | {"workers"},
-    "survey": CHAIN | {"parcel", "recipe", "stac", "store", "workers", "dask_engine"},
+    "plan": CHAIN | {"parcel", "recipe", "store"},
+    "survey": CHAIN | {"parcel", "plan", "recipe", "stac", "store", "workers", "dask_engine"},
     "estate": CHAIN,
     "canopy_accuracy": CHAIN | {"parcel"},
     "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
     "bench_jobs": CHAIN | {"parcel"},
     "bench": {"errors", "paths", "tables", "processes", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
-    "cli": CHAIN | {"parcel", "survey", "template"},
+    "cli": CHAIN | {"parcel", "plan", "survey", "template"},
     "__main__": {"cli"},
-    "flows": CHAIN | {"parcel", "recipe", "survey", "estate", "processes", "cli", "flows"},
+    "flows": CHAIN | {"parcel", "recipe", "plan", "survey", "estate", "processes", "cli", "flows"},
 }
 
 

@@ -21,8 +21,9 @@ from vinemap.errors import InputError, OutputError, WorkerError
 from vinemap.las import read_cloud
 from vinemap.parcel import map_parcel
 from vinemap.pieces import read_piece, split_cloud
+from vinemap.plan import CURRENT, DONE, FAILED
 from vinemap.scenes import hillside, rows_of
-from vinemap.survey import CURRENT, DONE, FAILED, map_survey
+from vinemap.survey import map_survey
 from vinemap.synthetic import Vineyard, simulate, write_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
