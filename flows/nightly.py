@@ -20,7 +20,7 @@ from vinemap.cli import plain_errors
 from vinemap.config import load_estate
 from vinemap.errors import BusyError, VinemapError
 from vinemap.estate import Arrival, arrivals
-from vinemap.survey import FAILED, Outcome, plan_survey
+from vinemap.plan import FAILED, Outcome, plan_survey
 
 
 class Night(NamedTuple):

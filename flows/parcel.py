@@ -18,8 +18,9 @@ from vinemap.cli import plain_errors, progress
 from vinemap.config import SurveyConfig, choose_parcel, load_survey
 from vinemap.crs import parse_crs
 from vinemap.errors import ConfigError, InputError
-from vinemap.parcel import Summary, map_parcel
+from vinemap.parcel import Summary, follow
 from vinemap.pdal_engine import check_engine
+from vinemap.recipe import recipe_of
 from vinemap.scenes import barolo
 from vinemap.synthetic import write_survey
 
@@ -41,18 +42,17 @@ def as_tasks(show: Callable[..., Any]) -> Callable[..., Any]:
 @flow(name="parcel", flow_run_name="{survey}-{parcel}", persist_result=False, validate_parameters=False)
 def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
     """Map one parcel of a survey."""
-    cloud = config.cloud or paths.survey_cloud(survey)
-    boundary = config.boundaries or paths.survey_boundaries(survey)
+    recipe = recipe_of(
+        config.cloud or paths.survey_cloud(survey),
+        parcel=parcel,
+        boundary=config.boundaries or paths.survey_boundaries(survey),
+        crs=parse_crs(config.crs) if config.crs else None,
+        survey=survey,
+        **dict(config.of_parcel(parcel)),
+    )
+    products = paths.survey_products(survey)
     with progress(parcel) as show:
-        return map_parcel(
-            cloud,
-            paths.product_folder(survey, parcel),
-            parcel=parcel,
-            boundary=boundary,
-            crs=parse_crs(config.crs) if config.crs else None,
-            **dict(config.of_parcel(parcel)),
-            step=as_tasks(show),
-        )
+        return follow(recipe, products / parcel, within=products, step=as_tasks(show))
 
 
 def ensure_cloud(config: SurveyConfig) -> None:

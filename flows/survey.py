@@ -21,7 +21,8 @@ from vinemap.cli import plain_errors
 from vinemap.config import SurveyConfig, load_estate, load_survey
 from vinemap.errors import ConfigError, VinemapError
 from vinemap.estate import arrivals
-from vinemap.survey import FAILED, Outcome, map_survey
+from vinemap.plan import FAILED, Outcome
+from vinemap.survey import map_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -69,6 +70,8 @@ def survey_flow(config: SurveyConfig, folder: Path, *, again: bool = False) -> S
     for outcome in map_survey(config, folder, again=again, step=as_task):
         outcomes.append(outcome)
         (log.error if outcome.state == FAILED else log.info)(outcome.line())
+        if sys.stderr.isatty():
+            click.echo(outcome.line(), err=True)
     outcomes.sort(key=lambda outcome: outcome.parcel)
     create_table_artifact([dict(zip(COLUMNS, row, strict=True)) for row in rows_of(outcomes)], key="survey")
     failed = [outcome.parcel for outcome in outcomes if outcome.state == FAILED]

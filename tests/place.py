@@ -8,6 +8,7 @@ import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 from vinemap.processes import descendants
@@ -91,8 +92,19 @@ class Place:
 
     def ask(self, path, body):
         request = Request(self.api + path, json.dumps(body).encode(), {"Content-Type": "application/json"})
-        with urlopen(request, timeout=30) as answer:
-            return json.load(answer)
+
+        def answer():
+            try:
+                with urlopen(request, timeout=30) as given:
+                    return [json.load(given)]
+            except HTTPError as error:
+                # Its database is busy: Prefect's own clients ask again, too.
+                if error.code != 503:
+                    raise
+                error.close()
+                return None
+
+        return wait(answer)[0]
 
     def runs(self, state=None):
         chosen = {"flow_runs": {"state": {"type": {"any_": [state]}}}} if state else {}

@@ -15,6 +15,7 @@ import shapely
 
 from vinemap import estate
 from vinemap.config import EstateConfig, load_estate
+from vinemap.errors import InputError
 from vinemap.estate import arrivals, unfinished
 from vinemap.las import read_cloud
 
@@ -481,10 +482,10 @@ def test_a_cloud_that_vanishes_meanwhile(clouds, place, monkeypatch):
 
 def test_an_empty_estate_and_none(place):
     assert found(place) == []
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(InputError, match=r"none: can't be read \(No such file or directory\)"):
         found(place / "none")
     (place / "file").touch()
-    with pytest.raises(NotADirectoryError):
+    with pytest.raises(InputError, match=r"file: can't be read \(Not a directory\)"):
         found(place / "file")
 
 

@@ -93,10 +93,15 @@ import flows.survey
 
 async def seen():
     async with get_client() as client:
-        tasks = [(r.name, r.state_name, r.run_count) for r in await client.read_task_runs()]
+        runs = [r for r in await client.read_flow_runs() if r.name == "twice"]
+        tasks = [
+            (r.name, r.state_name, r.run_count)
+            for r in await client.read_task_runs()
+            if r.flow_run_id in [run.id for run in runs]
+        ]
         chosen = ArtifactFilter(key=ArtifactFilterKey(any_=["survey"]))
         tables = [json.loads(a.data) for a in await client.read_artifacts(artifact_filter=chosen)]
-        flows = [(r.state_name, r.state.message) for r in await client.read_flow_runs()]
+        flows = [(r.state_name, r.state.message) for r in runs]
         return {"tasks": sorted(tasks), "tables": tables, "flows": flows}
 
 def show():
@@ -106,8 +111,10 @@ def show():
 
 def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
     """Of two parcels in the same polygon, one with an origin that lies elsewhere."""
-    (place / "two.yaml").write_text("survey: small\nparcels: [B, C]\noverrides: {C: {origin: [0, 0, 0]}}\n")
-    shutil.rmtree(place / "prefect", ignore_errors=True)
+    (place / "two.yaml").write_text(
+        "survey: twice\ncloud: data/surveys/small/small.laz\nboundaries: data/surveys/small/parcels.gpkg\n"
+        "parcels: [B, C]\noverrides: {C: {origin: [0, 0, 0]}}\n"
+    )
     done = flow(place, code=SEEN + "sys.argv[1:] = ['two.yaml']\ntry:\n    flows.survey.main()\nfinally:\n    show()")
     assert done.returncode == 1
     assert done.stderr == "vinemap: 1 of 2 parcels failed\n"

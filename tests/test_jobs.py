@@ -24,8 +24,9 @@ from vinemap.crs import parse_crs
 from vinemap.errors import BusyError, InputError, OutputError, VinemapError, WorkerError
 from vinemap.las import read_cloud
 from vinemap.pieces import read_piece, split_cloud
+from vinemap.plan import CURRENT, DONE, FAILED, OUTSIDE, plan_survey
 from vinemap.processes import descendants
-from vinemap.survey import CURRENT, DONE, FAILED, OUTSIDE, map_survey, plan_survey
+from vinemap.survey import map_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_parcels
 

@@ -4,7 +4,8 @@ import os
 import re
 import shutil
 import signal
-import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 from pathlib import Path
 
@@ -150,8 +151,12 @@ def test_no_schedule(place, options, said):
 
 
 def test_port_of_another(place):
-    with socket.create_server(("127.0.0.1", place.port)):
-        line = place.fails()
+    with ThreadingHTTPServer(("127.0.0.1", place.port), BaseHTTPRequestHandler) as other:
+        threading.Thread(target=other.serve_forever).start()
+        try:
+            line = place.fails()
+        finally:
+            other.shutdown()
     assert f"port {place.port} is in use" in line
     assert line.count("\n") == 1
 

@@ -114,7 +114,8 @@ def survey(
     """Map many parcels of CLOUD (LAS, LAZ or COPC) in one job; exit code 1 if one of them fails."""
     from vinemap import paths
     from vinemap.config import load_settings, survey_config
-    from vinemap.survey import FAILED, map_survey
+    from vinemap.plan import FAILED
+    from vinemap.survey import map_survey
 
     name = paths.stem(cloud)
     config = survey_config(

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_
 
 from vinemap.crs import Origin, check_origin, parse_crs
 from vinemap.errors import ConfigError, InputError
+from vinemap.paths import LONGEST_NAME, MOST_BYTES
 from vinemap.settings import Options, Settings
 
 if TYPE_CHECKING:
@@ -28,9 +29,6 @@ FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]
 """Characters that a name of a file can't have on one system or another."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
-LONGEST_NAME = 64
-MOST_BYTES = 160
-"""Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 80
 
@@ -78,7 +76,9 @@ class JobOptions(Options):
 
     engine: Literal["processes", "dask"] = Field("processes", description="processes here, or a Dask cluster's workers")
     scheduler: str | None = Field(None, description="address of the Dask scheduler, as tcp://host:8786")
-    workers: int | None = Field(None, ge=1, le=10_000, description="parcels worked at once; none: the cores' number")
+    workers: int | None = Field(
+        None, ge=1, le=10_000, description="parcels worked at once; none: as cores and memory allow"
+    )
     limit: float = Field(3600, gt=0, le=1_000_000, description="seconds that a parcel may take")
     memory: float | None = Field(
         None, ge=0.5, le=100_000, description="memory that a parcel may take (GB); none: its share of what there is"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Where Linux states the memory of a container, in its second and first version of control groups."""
+_given: int | None = None
 
 
 def cores() -> int:
@@ -18,8 +19,16 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
+def use_memory(most: int) -> None:
+    """Let this process know of so many bytes of memory, as others work beside it."""
+    global _given  # noqa: PLW0603
+    _given = most
+
+
 def memory() -> int:
-    """Bytes of memory, or of its part that is a container's."""
+    """Bytes of memory, or of its part that is a container's or this process's."""
+    if _given:
+        return _given
     try:
         most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError):  # not on Windows

@@ -191,6 +191,8 @@ def map_parcel(
         If the input can't be used or the product can't be written.
     """
     name = check_name(parcel)
+    if settings:
+        check_engine(settings.ground.engine)
     recipe = recipe_of(cloud, parcel=name, named=named, boundary=boundary, settings=settings, crs=crs, origin=origin)
     return follow(recipe, folder, step=step)
 
@@ -202,7 +204,6 @@ def follow(
     piece: Piece | None = None,
     drafts: Path | None = None,
     within: Path | None = None,
-    share: float = 1.0,
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Make a product by its recipe.
@@ -217,8 +218,6 @@ def follow(
         The parcel's points, where the cloud was read before.
     drafts, within : Path, optional
         As for :func:`vinemap.store.product`.
-    share : float
-        Share of the memory that is this run's, where others run beside it.
     step : callable
         As for :func:`map_parcel`.
 
@@ -242,7 +241,7 @@ def follow(
     with store.product(folder, drafts=drafts, within=within) as draft:
         collector = Collector(
             paths.tiles(draft),
-            most=settings.reading.max_points or int(share * _most_points()),
+            most=settings.reading.max_points or _most_points(),
             block=block_side(settings.ground.resolution),
         )
         points: Cloud
@@ -312,7 +311,9 @@ def follow(
         record = {
             "vinemap": __version__,
             "key": recipe.key,
+            "survey": recipe.survey,
             "parcel": parcel,
+            "flown": recipe.flown.isoformat(),
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "inputs": [source.record() for source in recipe.sources],
             "settings": settings.model_dump(mode="json"),

@@ -7,6 +7,9 @@ import re
 from pathlib import Path
 
 DATA = Path("data")
+LONGEST_NAME = 64
+MOST_BYTES = 160
+"""Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
@@ -16,7 +19,8 @@ ESTATE = Path("configs/nightly.yaml")
 
 def stem(cloud: Path) -> str:
     """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
-    return re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))[:64] or "cloud"
+    name = re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))
+    return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ") or "cloud"
 
 
 def configuration(survey: str) -> Path:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.errors import InputError, OutputError
+from vinemap.errors import InputError
 from vinemap.las import boundary_in, collected, open_cloud
 from vinemap.zones import deal, zones_of
 
@@ -57,7 +57,7 @@ def split_cloud(
     ------
     InputError
         If the file can't be read, as in :func:`vinemap.las.read_cloud`.
-    OutputError
+    OSError
         If the folder is full.
     """
     with open_cloud(cloud, crs=crs) as (target, vertical, chunks):
@@ -74,16 +74,13 @@ def split_cloud(
         if not polygons:
             return pieces
         zones = zones_of(polygons)
-        try:
-            for path in paths:
-                path.touch()
-            for chunk in chunks:
-                xyz, start = deal(chunk, zones)
-                for k in np.flatnonzero(np.diff(start)):
-                    with paths[k].open("ab") as stream:
-                        stream.write(xyz[start[k] : start[k + 1]].data)
-        except OSError as error:
-            raise OutputError(f"{folder.parent}: can't be written ({error.strerror}): make room there") from error
+        for path in paths:
+            path.touch()
+        for chunk in chunks:
+            xyz, start = deal(chunk, zones)
+            for k in np.flatnonzero(np.diff(start)):
+                with paths[k].open("ab") as stream:
+                    stream.write(xyz[start[k] : start[k + 1]].data)
     return pieces
 
 

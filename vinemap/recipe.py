@@ -147,8 +147,14 @@ def recipe_of(
     settings: Settings | None = None,
     crs: CRS | None = None,
     origin: Origin | None = None,
+    survey: str | None = None,
 ) -> Recipe:
     """Gather what the product of one parcel depends on, as :func:`vinemap.parcel.map_parcel` is told.
+
+    Parameters
+    ----------
+    survey : str, optional
+        Name of the survey whose parcels' products lie side by side.
 
     Raises
     ------
@@ -157,7 +163,7 @@ def recipe_of(
     """
     polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
     sources = tuple(read_source(path) for path in (cloud, boundary) if path)
-    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]))
+    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]), survey)
 
 
 def flown(cloud: Source) -> datetime:

@@ -3,83 +3,40 @@
 from __future__ import annotations
 
 import contextvars
-import json
 import time
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from vinemap import __version__, machine, paths
-from vinemap.config import check_name
-from vinemap.crs import parse_crs
+from vinemap import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError
-from vinemap.parcel import Summary, call, follow, found
+from vinemap.parcel import call, follow
 from vinemap.pieces import split_cloud
-from vinemap.recipe import Recipe, Source, flown, product_in, read_source
+from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
 from vinemap.stac import write_collection
-from vinemap.store import workshop, write_whole
-from vinemap.vector import read_parcels
+from vinemap.store import unwritable, workshop
 from vinemap.workers import Worker, Workers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from concurrent.futures import Future
     from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from pyproj import CRS
 
     from vinemap.config import SurveyConfig
     from vinemap.las import Boundary
+    from vinemap.parcel import Summary
     from vinemap.pieces import Piece
+    from vinemap.recipe import Recipe
 
-DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
-"""What can become of a parcel."""
 MOST_MEMORY = 0.8
 """Share of the memory that a job takes."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a parcel."""
-
-    parcel: str
-    state: str
-    rows: int = 0
-    length: float = 0.0
-    """Of all rows (m)."""
-    seconds: float = 0.0
-    reason: str = ""
-    """Why it failed, or what is to be known of it."""
-    heals: bool = False
-    """Whether it may go well another time, with the same input."""
-    key: str = ""
-    """Of the recipe."""
-
-    def line(self) -> str:
-        """The same as a sentence."""
-        what = f"{found(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
-        colon = "; " if self.state == DONE else ": "
-        return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
-
-
-class Plan(NamedTuple):
-    """What is to be done for a survey, and what is settled without."""
-
-    sources: tuple[Source, ...]
-    flown: datetime
-    recipes: list[Recipe]
-    settled: list[Outcome]
-    listed: bool
-    """Whether somebody has named the parcels, so that each must be in the cloud."""
-
-
-class _Earlier(NamedTuple):
-    """What the last job in a folder has left."""
-
-    sources: list[Source]
-    outcomes: dict[str, Outcome]
+ROOM = 1.5e9
+"""Bytes that a parcel's process has at the least: on small machines there are fewer."""
 
 
 class Engine(Protocol):
@@ -92,60 +49,6 @@ class Engine(Protocol):
 
     def stop(self) -> None:
         """Break off what runs."""
-
-
-def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> Plan:
-    """Find out which parcels of a survey need to be mapped: those whose recipe is another than their product's.
-
-    Parameters
-    ----------
-    config : SurveyConfig
-        The survey.
-    folder : Path
-        Folder of its products' folders.
-    again : bool
-        Whether to map them all.
-
-    Raises
-    ------
-    InputError
-        If the cloud or the boundaries can't be read.
-    """
-    cloud = config.cloud or paths.survey_cloud(config.survey)
-    boundaries = config.boundaries or paths.survey_boundaries(config.survey)
-    hashed, known = _earlier(folder)
-    polygons: dict[str, Boundary | InputError | None]
-    sources: tuple[Source, ...]
-    if config.boundaries is None and config.parcels is None and not boundaries.exists():
-        sources, polygons = (read_source(cloud, hashed),), {config.survey: None}
-    else:
-        sources = read_source(cloud, hashed), read_source(boundaries, hashed)
-        polygons = {**read_parcels(boundaries, config.parcels)}
-    crs, date, listed = parse_crs(config.crs) if config.crs else None, flown(sources[0]), config.parcels is not None
-    plan = Plan(sources, date, [], [], listed)
-    lasting = {FAILED} if listed else {FAILED, OUTSIDE}
-    hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
-    for name, polygon in polygons.items():
-        try:
-            parcel = check_name(name)
-        except ConfigError as error:
-            plan.settled.append(Outcome(name, FAILED, reason=str(error)))
-            continue
-        if isinstance(polygon, InputError):
-            plan.settled.append(Outcome(parcel, FAILED, reason=str(polygon)))
-            continue
-        own = config.of_parcel(parcel)
-        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin, date, config.survey)
-        key = recipe.key
-        product = None if again else product_in(folder / parcel)
-        if product and (product.key, product.parcel) == (key, parcel):
-            numbers = product.rows, product.length, 0.0
-            plan.settled.append(Outcome(parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key))
-        elif parcel in hopeless and hopeless[parcel].key == key:
-            plan.settled.append(hopeless[parcel])
-        else:
-            plan.recipes.append(recipe)
-    return plan
 
 
 def map_survey(
@@ -196,13 +99,10 @@ def map_survey(
             outcomes += [Outcome(r.parcel, FAILED, reason=str(error), key=r.key) for r in left]
             raise
         finally:
-            _write_record(config, folder, plan, outcomes, began)
-            write_collection(
-                folder,
-                survey=config.survey,
-                flown=plan.flown,
-                sources=[(source.path, source.record()) for source in plan.sources],
-            )
+            if outcomes:
+                write_record(folder, config.survey, plan, outcomes, began)
+                given = [(source.path, source.record()) for source in plan.sources]
+                write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
@@ -218,13 +118,15 @@ def _engine(plan: Plan, config: SurveyConfig) -> AbstractContextManager[Engine]:
         from vinemap.dask_engine import DaskWorkers
 
         return DaskWorkers(job.scheduler or "", memory=job.memory)
-    n = min(job.workers or machine.cores(), len(plan.recipes))
+    room = 1e9 * job.memory if job.memory else ROOM
+    most = min(machine.cores(), max(1, int(MOST_MEMORY * machine.memory() / room)))
+    n = min(job.workers or most, len(plan.recipes))
     return Workers(n, cores=max(1, machine.cores() // n), memory=_memory(config, n))
 
 
 def _memory(config: SurveyConfig, n: int) -> int:
     """Bytes that each of n processes may take."""
-    return int(config.job.memory * 1e9) if config.job.memory else int(MOST_MEMORY * machine.memory() / n)
+    return int(config.job.memory * 1e9 if config.job.memory else max(ROOM, MOST_MEMORY * machine.memory() / n))
 
 
 def _work(
@@ -259,11 +161,9 @@ def _work(
 
 def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recipe, Piece | Outcome | None]]:
     """Recipes with their points, the largest first; with none where a parcel reads them itself, of a COPC's, say."""
-    together = [r for r in plan.recipes if r.boundary and r.settings.ground.engine != "pdal"]
-    if len(together) < 2:
-        together = []
+    together = [r for r in plan.recipes if _is_dealt(r)] if sum(map(_is_dealt, plan.recipes)) > 1 else []
     for recipe in plan.recipes:
-        if recipe not in together:
+        if not together or not _is_dealt(recipe):
             yield recipe, None
     if not together:
         return
@@ -271,7 +171,7 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
     reader = Worker(cores=machine.cores(), memory=_memory(config, 1))
     try:
         boundaries = [recipe.boundary for recipe in together]
-        pieces = reader.run(split_cloud, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
+        pieces = reader.run(_split, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
     except WorkerError as error:
         raise WorkerError(f"{cloud}: can't be read: {error}") from error
     finally:
@@ -288,6 +188,18 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
             yield recipe, piece
 
 
+def _is_dealt(recipe: Recipe) -> bool:
+    """Whether a parcel can have its points from where the cloud is read once for all."""
+    return recipe.boundary is not None and recipe.settings.ground.engine != "pdal"
+
+
+def _split(cloud: Path, boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None) -> list[Piece | InputError]:
+    try:
+        return split_cloud(cloud, boundaries, aside, crs=crs)
+    except OSError as error:
+        raise unwritable(aside.parent, error) from error
+
+
 def _run(
     recipe: Recipe,
     piece: Piece | None,
@@ -301,7 +213,7 @@ def _run(
     """Have a parcel worked, and tell what became of it."""
     began = time.perf_counter()
     failed = partial(Outcome, recipe.parcel, FAILED, key=recipe.key)
-    options = {"piece": piece, "drafts": aside, "within": folder, "share": 1 / workers.slots, "limit": limit}
+    options = {"piece": piece, "drafts": aside, "within": folder, "limit": limit}
     try:
         summary: Summary = step(recipe.parcel, workers.run, follow, recipe, folder / recipe.parcel, **options)
     except OutsideError as error:
@@ -316,30 +228,3 @@ def _run(
             piece.path.unlink(missing_ok=True)
     numbers = summary.rows, round(summary.length, 3), round(summary.seconds, 3)
     return Outcome(recipe.parcel, DONE, *numbers, reason="; ".join(summary.warnings), key=recipe.key)
-
-
-def _earlier(folder: Path) -> _Earlier:
-    """What the last job in a folder has left, if it can be read."""
-    try:
-        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
-        sources = [
-            Source(Path(s["path"]), str(s["sha256"]), tuple(s["stamp"]), float(s["read"])) for s in record["sources"]
-        ]
-        outcomes = {one["parcel"]: Outcome(**one) for one in record["parcels"] if isinstance(one["parcel"], str)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return _Earlier([], {})
-    return _Earlier(sources, outcomes)
-
-
-def _write_record(config: SurveyConfig, folder: Path, plan: Plan, outcomes: list[Outcome], began: datetime) -> None:
-    known = _earlier(folder).outcomes if plan.listed else {}
-    known |= {o.parcel: replace(o, state=DONE if o.state == CURRENT else o.state) for o in outcomes}
-    record = {
-        "vinemap": __version__,
-        "survey": config.survey,
-        "began": began.isoformat(timespec="seconds"),
-        "seconds": round((datetime.now(UTC) - began).total_seconds(), 3),
-        "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
-        "parcels": [asdict(known[name]) for name in sorted(known)],
-    }
-    write_whole(paths.survey_record(folder), json.dumps(record, indent=2, ensure_ascii=False))

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from vinemap.errors import VinemapError, WorkerError
+from vinemap.machine import use_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -287,6 +288,7 @@ def _limit(memory: int) -> None:
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("900", encoding="ascii")
     if memory:
+        use_memory(memory)
         with contextlib.suppress(ImportError, ValueError, OSError):  # not on Windows
             import resource
 

@@ -1,0 +1,157 @@
+"""What a survey needs: which parcels are up to date, which can't be mapped, and which are to be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from vinemap import __version__, paths
+from vinemap.config import check_name
+from vinemap.crs import parse_crs
+from vinemap.errors import ConfigError, InputError
+from vinemap.parcel import found
+from vinemap.recipe import Recipe, Source, flown, product_in, read_source
+from vinemap.store import write_whole
+from vinemap.vector import read_parcels
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from vinemap.config import SurveyConfig
+    from vinemap.las import Boundary
+
+DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
+"""What can become of a parcel."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a parcel."""
+
+    parcel: str
+    state: str
+    rows: int = 0
+    length: float = 0.0
+    """Of all rows (m)."""
+    seconds: float = 0.0
+    reason: str = ""
+    """Why it failed, or what is to be known of it."""
+    heals: bool = False
+    """Whether it may go well another time, with the same input."""
+    key: str = ""
+    """Of the recipe."""
+
+    def line(self) -> str:
+        """The same as a sentence."""
+        what = f"{found(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
+        colon = "; " if self.state == DONE else ": "
+        return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
+
+
+class Plan(NamedTuple):
+    """What is to be done for a survey, and what is settled without."""
+
+    sources: tuple[Source, ...]
+    flown: datetime
+    recipes: list[Recipe]
+    settled: list[Outcome]
+    listed: bool
+    """Whether somebody has named the parcels, so that each must be in the cloud."""
+
+
+class _Earlier(NamedTuple):
+    """What the last job in a folder has left."""
+
+    sources: list[Source]
+    outcomes: dict[str, Outcome]
+
+
+def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> Plan:
+    """Find out which parcels of a survey need to be mapped: those whose recipe is another than their product's.
+
+    Parameters
+    ----------
+    config : SurveyConfig
+        The survey.
+    folder : Path
+        Folder of its products' folders.
+    again : bool
+        Whether to map them all.
+
+    Raises
+    ------
+    InputError
+        If the cloud or the boundaries can't be read.
+    """
+    cloud = config.cloud or paths.survey_cloud(config.survey)
+    boundaries = config.boundaries or paths.survey_boundaries(config.survey)
+    hashed, known = _earlier(folder)
+    polygons: dict[str, Boundary | InputError | None]
+    sources: tuple[Source, ...]
+    if config.boundaries is None and config.parcels is None and not boundaries.exists():
+        sources, polygons = (read_source(cloud, hashed),), {config.survey: None}
+    else:
+        sources = read_source(cloud, hashed), read_source(boundaries, hashed)
+        polygons = {**read_parcels(boundaries, config.parcels)}
+    crs, date, listed = parse_crs(config.crs) if config.crs else None, flown(sources[0]), config.parcels is not None
+    plan = Plan(sources, date, [], [], listed)
+    lasting = {FAILED} if listed else {FAILED, OUTSIDE}
+    hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
+    for name, polygon in polygons.items():
+        try:
+            parcel = check_name(name)
+        except ConfigError as error:
+            plan.settled.append(Outcome(name, FAILED, reason=str(error)))
+            continue
+        if isinstance(polygon, InputError):
+            plan.settled.append(Outcome(parcel, FAILED, reason=str(polygon)))
+            continue
+        own = config.of_parcel(parcel)
+        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin, date, config.survey)
+        key = recipe.key
+        product = None if again else product_in(folder / parcel)
+        if product and (product.key, product.parcel) == (key, parcel):
+            numbers = product.rows, product.length, 0.0
+            plan.settled.append(Outcome(parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key))
+        elif parcel in hopeless and hopeless[parcel].key == key:
+            plan.settled.append(hopeless[parcel])
+        else:
+            plan.recipes.append(recipe)
+    return plan
+
+
+def _earlier(folder: Path) -> _Earlier:
+    """What the last job in a folder has left, if it can be read."""
+    try:
+        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
+        sources = [
+            Source(Path(s["path"]), str(s["sha256"]), tuple(s["stamp"]), float(s["read"])) for s in record["sources"]
+        ]
+        outcomes = {one["parcel"]: Outcome(**one) for one in record["parcels"] if isinstance(one["parcel"], str)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return _Earlier([], {})
+    return _Earlier(sources, outcomes)
+
+
+def write_record(folder: Path, survey: str, plan: Plan, outcomes: Iterable[Outcome], began: datetime) -> None:
+    """Write ``survey.json``: what became of each parcel, for people and for the next job.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    known = _earlier(folder).outcomes if plan.listed else {}
+    known |= {o.parcel: replace(o, state=DONE if o.state == CURRENT else o.state) for o in outcomes}
+    record = {
+        "vinemap": __version__,
+        "survey": survey,
+        "began": began.isoformat(timespec="seconds"),
+        "seconds": round((datetime.now(UTC) - began).total_seconds(), 3),
+        "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
+        "parcels": [asdict(known[name]) for name in sorted(known)],
+    }
+    write_whole(paths.survey_record(folder), json.dumps(record, indent=2, ensure_ascii=False))
