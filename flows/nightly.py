@@ -16,8 +16,9 @@ from prefect.states import Completed, Failed
 
 from flows.serving import serve
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
+from vinemap import paths
 from vinemap.cli import plain_errors
-from vinemap.config import load_estate
+from vinemap.config import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError
 from vinemap.estate import Arrival, arrivals
 from vinemap.plan import FAILED, Outcome, plan_survey
@@ -69,8 +70,10 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
     if not arrival.config:
         return Night(arrival.name, [], arrival.reason, failed=not arrival.waits)
     try:
-        plan = plan_survey(arrival.config, folder)
-        outcomes = outcomes_of(arrival.config, folder) if plan.recipes else plan.settled
+        own = paths.configuration(arrival.name)
+        config = load_survey(own) if own.is_file() and own != paths.ESTATE else arrival.config
+        plan = plan_survey(config, folder)
+        outcomes = outcomes_of(config, folder) if plan.recipes else plan.settled
     except BusyError as error:
         return Night(arrival.name, [], str(error))
     except VinemapError as error:
