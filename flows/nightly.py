@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from vinemap.config import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError
 from vinemap.estate import Arrival, arrivals
 from vinemap.plan import FAILED, Outcome, plan_survey
+from vinemap.survey import map_survey
 
 
 class Night(NamedTuple):
@@ -72,12 +74,19 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
     try:
         own = paths.configuration(arrival.name)
         config = load_survey(own) if own.is_file() and own != paths.ESTATE else arrival.config
-        plan = plan_survey(config, folder)
-        outcomes = outcomes_of(config, folder) if plan.recipes else plan.settled
+        began, plan = time.time(), plan_survey(config, folder)
+        if plan.recipes:
+            outcomes = outcomes_of(config, folder)
+        else:  # what had to be read for that need not be read again
+            read = any(source.read >= began for source in plan.sources)
+            outcomes = list(map_survey(config, folder)) if read else plan.settled
     except BusyError as error:
         return Night(arrival.name, [], str(error))
     except VinemapError as error:
         return Night(arrival.name, [], str(error), failed=True)
+    except Exception as error:  # noqa: BLE001 - a fault of our own costs no other survey
+        reason = f"a fault of vinemap's own ({type(error).__name__}: {error})"
+        return Night(arrival.name, [], " ".join(reason.split()), failed=True)
     return Night(arrival.name, outcomes, failed=any(outcome.state == FAILED for outcome in outcomes))
 
 

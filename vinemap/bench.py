@@ -282,9 +282,9 @@ def many(millions: float, parcels: int, out: Path) -> Lines:
     files = load(made)
     must(job("reading", read, cloud=files["cloud"]))
     products = out / "products" / f"estate-{millions:g}M"
-    command = [sys.executable, "-m", "vinemap.cli", "survey", files["cloud"], "--boundaries", files["boundaries"]]
+    command = [sys.executable, "-m", "vinemap.cli", "survey", files["cloud"], "--again"]
     with summed_memory() as most:
-        whole = must([*command, "--out", str(products)])
+        whole = must([*command, "--boundaries", files["boundaries"], "--out", str(products)])
     found = load(read)
     seconds = Bar("", "", whole.seconds, 2.5 * found["seconds"], 1)
     memory = of_bar(Bar("", "", most[0] / 1e6, 2000, 0)) if most[0] else "–"

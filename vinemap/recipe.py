@@ -114,6 +114,7 @@ class Recipe(NamedTuple):
     origin: Origin | None
     """Origin of {Main}, where it is given."""
     flown: datetime
+    """For the record: a file that is only touched makes no other product."""
     survey: str | None = None
     """Name of the survey whose parcels' products lie side by side."""
 
@@ -133,7 +134,6 @@ class Recipe(NamedTuple):
             "origin": self.origin,
             "settings": self.settings.model_dump(mode="json"),
             "survey": self.survey,
-            "flown": self.flown.isoformat(),
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 

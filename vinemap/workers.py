@@ -8,6 +8,7 @@ notebooks, scripts without a main guard and Dask's daemonic workers can start so
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import pickle
 import queue
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+PR_SET_PDEATHSIG = 1
+"""Of Linux's prctl(2)."""
 LENGTH = struct.Struct("<Q")
 """Of the number of bytes that stands before a message."""
 SERVE = "import sys; sys.path[:] = sys.argv[3:]; from vinemap.workers import serve; serve(*map(int, sys.argv[1:3]))"
@@ -253,6 +256,7 @@ def serve(cores: int, memory: int) -> NoReturn:
     os.dup2(null, 0)
     os.dup2(2, 1)
     _limit(memory)
+    _die_with_parent()
     from vinemap.compiled import use_cores
 
     use_cores(cores)
@@ -293,3 +297,13 @@ def _limit(memory: int) -> None:
             import resource
 
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+
+
+def _die_with_parent() -> None:
+    """Have the system end this process with its parent (on Linux), even in the midst of a library's call."""
+    parent = os.getppid()
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(0)
