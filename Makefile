@@ -45,8 +45,8 @@ nightly: export CONFIG ?= configs/nightly.yaml
 nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=configs/nightly.yaml]
 	@exec $(BIN)/python -m flows.nightly "$$CONFIG" --serve
 
-test: $(READY) ## Run the tests
-	@$(BIN)/python -m pytest
+test: $(READY) ## Run the tests, two files at once
+	@$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check
