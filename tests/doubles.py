@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from vinemap import errors, store
 
 
-def follow(recipe, folder, *, piece=None, drafts=None, within=None, share=1.0):
+def follow(recipe, folder, *, piece=None, drafts=None, within=None):
     """Leave a product of two files, unless the parcel's name tells of something else."""
     began = time.perf_counter()
     with store.product(folder, drafts=drafts, within=within) as draft:
