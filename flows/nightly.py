@@ -20,7 +20,7 @@ from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap import paths
 from vinemap.cli import plain_errors
 from vinemap.config import load_estate, load_survey
-from vinemap.errors import BusyError, VinemapError
+from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.estate import Arrival, arrivals
 from vinemap.plan import FAILED, Outcome, plan_survey
 from vinemap.survey import map_survey
@@ -85,8 +85,7 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
     except VinemapError as error:
         return Night(arrival.name, [], str(error), failed=True)
     except Exception as error:  # noqa: BLE001 - a fault of our own costs no other survey
-        reason = f"a fault of vinemap's own ({type(error).__name__}: {error})"
-        return Night(arrival.name, [], " ".join(reason.split()), failed=True)
+        return Night(arrival.name, [], " ".join(own_fault(error).split()), failed=True)
     return Night(arrival.name, outcomes, failed=any(outcome.state == FAILED for outcome in outcomes))
 
 

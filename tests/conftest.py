@@ -2,12 +2,16 @@
 
 from pathlib import Path
 
+import geopandas as gpd
+import numpy as np
 import pytest
+import shapely
+from lasfiles import write_each
 
 from vinemap.cloud import PointCloud
 from vinemap.crs import parse_crs
 from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Vineyard, simulate
+from vinemap.synthetic import Vineyard, simulate, write_survey
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -30,3 +34,27 @@ def shared():
     if not (SHARED / "surveys").is_dir():
         pytest.skip("needs the shared surveys, which are not on this machine")
     return SHARED
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory):
+    """A whole file of each kind."""
+    return write_each(tmp_path_factory.mktemp("clouds"))
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """Three small parcels; in ``more.gpkg`` beside them one that shares its points with A, and one without any."""
+    place = np.mean(rows_of(1)[0], axis=0)
+    plots = [
+        Vineyard("A", rows_of(4, length=20, azimuth=33)),
+        Vineyard("B", rows_of(4, length=15, centre=tuple(place + [40, 0]))),
+        Vineyard("C", rows_of(5, length=18, azimuth=90, centre=tuple(place + [0, 40]))),
+    ]
+    survey = simulate(plots, hillside(0.1), name="three", density=200, seed=1)
+    path = write_survey(survey, tmp_path_factory.mktemp("survey"))
+    polygons = survey.parcels[["name", "geometry"]]
+    shapes = [*polygons.geometry, polygons.geometry[0].buffer(-2), shapely.box(0, 0, 9, 9)]
+    names = [*polygons["name"], "inner A", "empty"]
+    gpd.GeoDataFrame({"name": names}, geometry=shapes, crs=polygons.crs).to_file(path.with_name("more.gpkg"))
+    return path

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from vinemap import compiled
+from vinemap import machine
 from vinemap.compiled import ahead, in_threads, stretches
 
 
@@ -18,7 +18,7 @@ from vinemap.compiled import ahead, in_threads, stretches
 def test_stretches_cover_every_item_once(n):
     parts = stretches(n)
     assert [k for first, last in parts for k in range(first, last)] == list(range(n))
-    assert len(parts) == (compiled.CORES if n >= 16 else 1)
+    assert len(parts) == (machine.cores() if n >= 16 else 1)
 
 
 def test_results_in_the_items_order():

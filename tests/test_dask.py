@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from test_survey import SURVEYS, cloud, many, tree  # noqa: F401 - a fixture among them
+from products import SURVEYS, many, tree
 
 from vinemap import survey
 from vinemap.config import survey_config
@@ -71,7 +71,7 @@ def cluster(tmp_path_factory):
             process.wait()
 
 
-def job(cloud, folder, boundaries, **options):  # noqa: F811
+def job(cloud, folder, boundaries, **options):
     config = survey_config(survey="three", cloud=cloud, boundaries=boundaries, job=options)
     return list(map_survey(config, folder))
 
@@ -80,10 +80,10 @@ def by_dask(cluster):
     return {"engine": "dask", "scheduler": cluster[0]}
 
 
-def test_products_are_the_same_byte_for_byte(cluster, cloud, tmp_path):  # noqa: F811
-    boundaries = cloud.with_name("parcels.gpkg")
-    here = job(cloud, tmp_path / "here", boundaries)
-    there = job(cloud, tmp_path / "there", boundaries, **by_dask(cluster))
+def test_products_are_the_same_byte_for_byte(cluster, three, tmp_path):
+    boundaries = three.with_name("parcels.gpkg")
+    here = job(three, tmp_path / "here", boundaries)
+    there = job(three, tmp_path / "there", boundaries, **by_dask(cluster))
     assert [outcome.state for outcome in here + there] == [DONE] * 6
     assert tree(tmp_path / "here") == tree(tmp_path / "there")
     assert {path.name for path in (tmp_path / "there").iterdir()} == {"A", "B", "C", *SURVEYS}
@@ -108,11 +108,11 @@ def worker_of(pid):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
-def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, cloud, tmp_path, monkeypatch):  # noqa: F811
+def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, three, tmp_path, monkeypatch):
     """Nor do calls that crash or hang cost the cluster a worker."""
-    many(cloud, tmp_path / "many.gpkg", 2)
+    many(three, tmp_path / "many.gpkg", 2)
     monkeypatch.setattr(survey, "follow", misbehave)
-    outcomes = job(cloud, tmp_path / "out", tmp_path / "many.gpkg", limit=10, **by_dask(cluster))
+    outcomes = job(three, tmp_path / "out", tmp_path / "many.gpkg", limit=10, **by_dask(cluster))
     found = {outcome.parcel: outcome for outcome in outcomes}
     assert {name for name, outcome in found.items() if outcome.state == DONE} == {"A0", "A1", "B0", "B1"}
     assert found["C0"].line() == "C0: failed: its process died (SIGABRT)"
@@ -121,8 +121,8 @@ def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, cloud, tmp_path
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"A0", "A1", "B0", "B1", *SURVEYS}
 
 
-def test_a_scheduler_that_does_not_answer(cloud, tmp_path, monkeypatch):  # noqa: F811
+def test_a_scheduler_that_does_not_answer(three, tmp_path, monkeypatch):
     monkeypatch.setattr("vinemap.dask_engine.PATIENCE", 1.0)
     with pytest.raises(ConfigError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        job(cloud, tmp_path / "out", cloud.with_name("parcels.gpkg"), engine="dask", scheduler="tcp://127.0.0.1:9")
+        job(three, tmp_path / "out", three.with_name("parcels.gpkg"), engine="dask", scheduler="tcp://127.0.0.1:9")
     assert list(tmp_path.iterdir()) == []

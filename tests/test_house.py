@@ -14,7 +14,20 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
 
 BASE = {"errors", "crs", "compiled", "machine"}
-DATA = {"cloud", "raster", "vector", "mesh", "row_frame", "zones", "bins", "las", "pieces", "tiles", "pdal_engine"}
+DATA = {
+    "cloud",
+    "raster",
+    "vector",
+    "mesh",
+    "row_frame",
+    "zones",
+    "bins",
+    "las",
+    "las_end",
+    "pieces",
+    "tiles",
+    "pdal_engine",
+}
 STAGES = {
     "ground",
     "cover",

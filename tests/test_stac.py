@@ -23,9 +23,10 @@ from vinemap.crs import WGS84, project
 from vinemap.parcel import map_parcel
 from vinemap.raster import Grid, Raster, write_cog
 from vinemap.recipe import read_source
-from vinemap.stac import RASTERS, parcel_item, save, write_collection
+from vinemap.stac import parcel_item, save, write_collection
 from vinemap.synthetic import write_survey
 
+RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 UTM = CRS.from_epsg(32632)
 NOWHERE = CRS.from_proj4("+proj=tmerc +lat_0=44.6 +lon_0=7.9 +k=1 +x_0=1000 +y_0=2000 +ellps=WGS84 +units=m")
 FLOWN = datetime(2024, 6, 3, 11, 30, tzinfo=timezone(timedelta(hours=2)))

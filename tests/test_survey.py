@@ -13,7 +13,7 @@ import time
 import geopandas as gpd
 import numpy as np
 import pytest
-import shapely
+from products import SURVEYS, content, many, tree
 
 from vinemap import paths
 from vinemap.config import survey_config
@@ -22,35 +22,18 @@ from vinemap.las import read_cloud
 from vinemap.parcel import map_parcel
 from vinemap.pieces import read_piece, split_cloud
 from vinemap.plan import CURRENT, DONE, FAILED
-from vinemap.scenes import hillside, rows_of
 from vinemap.survey import map_survey
-from vinemap.synthetic import Vineyard, simulate, write_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
 
-SURVEYS = ["collection.json", "survey.json", "three_stac.json"]
-"""Files of a survey, beside the folders of its products."""
 KILLS = int(os.environ.get("VINEMAP_KILLS", "2"))
 """Instants at which a job is killed."""
 VINEMAP = [sys.executable, "-m", "vinemap.cli"]
 
 
 @pytest.fixture(scope="module")
-def cloud(tmp_path_factory):
-    """Three small parcels; in ``more.gpkg`` beside them one that shares its points with A, and one without any."""
-    place = np.mean(rows_of(1)[0], axis=0)
-    plots = [
-        Vineyard("A", rows_of(4, length=20, azimuth=33)),
-        Vineyard("B", rows_of(4, length=15, centre=tuple(place + [40, 0]))),
-        Vineyard("C", rows_of(5, length=18, azimuth=90, centre=tuple(place + [0, 40]))),
-    ]
-    survey = simulate(plots, hillside(0.1), name="three", density=200, seed=1)
-    path = write_survey(survey, tmp_path_factory.mktemp("survey"))
-    polygons = survey.parcels[["name", "geometry"]]
-    shapes = [*polygons.geometry, polygons.geometry[0].buffer(-2), shapely.box(0, 0, 9, 9)]
-    names = [*polygons["name"], "inner A", "empty"]
-    gpd.GeoDataFrame({"name": names}, geometry=shapes, crs=polygons.crs).to_file(path.with_name("more.gpkg"))
-    return path
+def cloud(three):
+    return three
 
 
 @pytest.fixture(scope="module")
@@ -70,22 +53,6 @@ def mapped(cloud, boundaries, tmp_path_factory):
 def job(cloud, folder, *, boundaries, again=False, step=None, **options):
     config = survey_config(survey="three", cloud=cloud, boundaries=boundaries, **options)
     return map_survey(config, folder, again=again, **({"step": step} if step else {}))
-
-
-def tree(folder):
-    """All files under a folder with their bytes; of the records of runs what isn't a time."""
-    return {path.relative_to(folder).as_posix(): content(path) for path in folder.rglob("*") if path.is_file()}
-
-
-def content(path):
-    if path.name not in (paths.RUN, "survey.json"):
-        return path.read_bytes()
-    record = json.loads(path.read_text())
-    for name in ("created", "seconds", "began"):
-        record.pop(name, None)
-    for one in (*record.get("sources", ()), *record.get("parcels", ())):
-        one.pop("read" if "read" in one else "seconds")
-    return record
 
 
 @pytest.mark.parametrize("parcel", ["A", "B", "C", "inner A"])
@@ -242,13 +209,6 @@ def children(group):
     """Processes of a group that still run."""
     listed = subprocess.run(["ps", "-eo", "pgid=,stat="], capture_output=True, text=True, check=True).stdout
     return [line for line in listed.splitlines() if line.split()[0] == str(group) and "Z" not in line]
-
-
-def many(cloud, path, n):
-    """Write the polygons of the three parcels so many times each, every time under another name."""
-    parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
-    names = [f"{name}{k}" for k in range(n) for name in parcels["name"]]
-    gpd.GeoDataFrame({"name": names}, geometry=[*parcels.geometry] * n, crs=parcels.crs).to_file(path)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no such signals here")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from vinemap import __version__
-from vinemap.errors import VinemapError
+from vinemap.errors import VinemapError, own_fault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -214,7 +214,7 @@ def plain_errors() -> Iterator[None]:
     except Exception as error:
         if os.environ.get("VINEMAP_TRACEBACK"):
             raise
-        _fail(f"a fault of vinemap's own ({type(error).__name__}: {error}); VINEMAP_TRACEBACK=1 shows where", 1)
+        _fail(f"{own_fault(error)}; VINEMAP_TRACEBACK=1 shows where", 1)
 
 
 def _stop(number: int, frame: object) -> NoReturn:

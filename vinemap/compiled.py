@@ -25,8 +25,6 @@ F = TypeVar("F", bound="Callable[..., object]")
 S = TypeVar("S")
 T = TypeVar("T")
 
-CORES = machine.cores()
-"""Cores that this process works on."""
 FEW = 16
 """Items that one core has done before another would have begun."""
 _here = threading.local()
@@ -38,12 +36,6 @@ def compiled(function: F) -> F:
         return cast("F", njit(cache=True, nogil=True)(function))
     except RuntimeError:  # no folder for the cache can be written: compile anew each time
         return cast("F", njit(nogil=True)(function))
-
-
-def use_cores(n: int) -> None:
-    """Let this process work on so many cores, as others work beside it; before any work."""
-    global CORES  # noqa: PLW0603
-    CORES = n
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
@@ -66,7 +58,7 @@ def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(CORES, initializer=_mark_busy)
+    return ThreadPoolExecutor(machine.cores(), initializer=_mark_busy)
 
 
 if hasattr(os, "register_at_fork"):
@@ -93,6 +85,6 @@ def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
 
 def stretches(n: int) -> list[tuple[int, int]]:
     """Stretches of n items, one a core but for few items, as first and last + 1."""
-    parts = CORES if n >= FEW else 1
+    parts = machine.cores() if n >= FEW else 1
     bounds = [n * k // parts for k in range(parts + 1)]
     return list(pairwise(bounds))

@@ -94,6 +94,5 @@ def _run(
 
     if not hasattr(_here, "worker"):
         n = get_worker().state.nthreads
-        most = memory or int(0.8 * machine.memory() / n)
-        _here.worker = Worker(cores=max(1, machine.cores() // n), memory=most)
+        _here.worker = Worker(cores=max(1, machine.cores() // n), memory=memory or machine.share(n))
     return _here.worker.run(function, *args, limit=limit, **kwargs)

@@ -43,3 +43,8 @@ class BusyError(VinemapError):
 
 class WorkerError(VinemapError):
     """A process died of its work, or would have taken more than it may."""
+
+
+def own_fault(error: BaseException, where: str = "") -> str:
+    """What is said of an error that vinemap didn't raise on purpose."""
+    return f"a fault of vinemap's own ({type(error).__name__}: {error}{where})"

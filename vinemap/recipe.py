@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import shapely
@@ -75,14 +76,22 @@ def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
     for source in known:
         if (source.path, source.stamp) == (path, stamp) and max(stamp[1:3]) < (source.read - SETTLED) * 1e9:
             return source
+    settled = max(stamp[1:3]) < (began - SETTLED) * 1e9
     try:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest = (_digest if settled else _digest.__wrapped__)(path, stamp)
     except OSError as error:
         raise _unreadable(path, error) from error
     source = Source(path, digest, stamp, began)
     source.check()
     return source
+
+
+@lru_cache(maxsize=64)
+def _digest(path: Path, stamp: tuple[int, ...]) -> str:
+    """SHA-256 of a file, worked out once a process: a night's plan asks for it, and then its job."""
+    del stamp
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 MEDIA_TYPES = {
     ".glb": "model/gltf-binary",
     ".gpkg": MediaType.GEOPACKAGE,
@@ -105,8 +104,8 @@ def parcel_item(
     for key, (path, title) in files.items():
         if path.exists():
             item.add_asset(key, _asset(path, folder, title))
-    for kind in RASTERS:
-        _add_raster(item, kind, paths.raster(folder, parcel, kind))
+    for path in sorted(folder.glob("*.tif")):
+        _add_raster(item, path.stem.removeprefix(f"{parcel}_"), path)
     item.add_asset("run", _asset(paths.run_record(folder), folder, "Inputs, settings and versions", role="metadata"))
     if survey:
         above = folder / ".."

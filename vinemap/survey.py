@@ -11,7 +11,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import machine
-from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError
+from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
 from vinemap.parcel import call, follow
 from vinemap.pieces import split_cloud
 from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
@@ -27,16 +27,11 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.config import SurveyConfig
+    from vinemap.config import JobOptions, SurveyConfig
     from vinemap.las import Boundary
     from vinemap.parcel import Summary
     from vinemap.pieces import Piece
     from vinemap.recipe import Recipe
-
-MOST_MEMORY = 0.8
-"""Share of the memory that a job takes."""
-ROOM = 1.5e9
-"""Bytes that a parcel's process has at the least: on small machines there are fewer."""
 
 
 class Engine(Protocol):
@@ -118,15 +113,13 @@ def _engine(plan: Plan, config: SurveyConfig) -> AbstractContextManager[Engine]:
         from vinemap.dask_engine import DaskWorkers
 
         return DaskWorkers(job.scheduler or "", memory=job.memory)
-    room = 1e9 * job.memory if job.memory else ROOM
-    most = min(machine.cores(), max(1, int(MOST_MEMORY * machine.memory() / room)))
-    n = min(job.workers or most, len(plan.recipes))
-    return Workers(n, cores=max(1, machine.cores() // n), memory=_memory(config, n))
+    n = min(job.workers or machine.most_processes(), len(plan.recipes))
+    return Workers(n, cores=max(1, machine.cores() // n), memory=_memory(job, n))
 
 
-def _memory(config: SurveyConfig, n: int) -> int:
+def _memory(job: JobOptions, n: int) -> int:
     """Bytes that each of n processes may take."""
-    return int(config.job.memory * 1e9 if config.job.memory else max(ROOM, MOST_MEMORY * machine.memory() / n))
+    return int(job.memory * 1e9) if job.memory else machine.share(n)
 
 
 def _work(
@@ -168,7 +161,7 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
     if not together:
         return
     cloud, limit = together[0].cloud, config.job.limit * len(together)
-    reader = Worker(cores=machine.cores(), memory=_memory(config, 1))
+    reader = Worker(cores=machine.cores(), memory=_memory(config.job, 1))
     try:
         boundaries = [recipe.boundary for recipe in together]
         pieces = reader.run(_split, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
@@ -222,7 +215,7 @@ def _run(
         known = isinstance(error, (InputError, ConfigError))
         return failed(seconds=time.perf_counter() - began, reason=str(error), heals=not known)
     except Exception as error:  # noqa: BLE001 - a fault of our own costs no other parcel
-        return failed(reason=f"a fault of vinemap's own ({type(error).__name__}: {error})", heals=True)
+        return failed(reason=own_fault(error), heals=True)
     finally:
         if piece:
             piece.path.unlink(missing_ok=True)

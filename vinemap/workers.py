@@ -22,8 +22,8 @@ import traceback
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
-from vinemap.errors import VinemapError, WorkerError
-from vinemap.machine import use_memory
+from vinemap.errors import VinemapError, WorkerError, own_fault
+from vinemap.machine import use
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -161,7 +161,7 @@ class Worker:
         try:
             good, value = pickle.loads(answer)  # noqa: S301 - from a process of ours
         except Exception as error:
-            raise WorkerError(f"a fault of vinemap's own (an answer that can't be read: {error})") from error
+            raise WorkerError(own_fault(error, " in an answer that can't be read")) from error
         return good, value
 
     def _dead(self, code: int) -> WorkerError:
@@ -255,11 +255,9 @@ def serve(cores: int, memory: int) -> NoReturn:
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(2, 1)
+    use(cores=cores, memory=memory)
     _limit(memory)
     _die_with_parent()
-    from vinemap.compiled import use_cores
-
-    use_cores(cores)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(calls, inbox), daemon=True).start()
     while True:
@@ -283,8 +281,8 @@ def _answer(message: bytes) -> bytes:
         return pickle.dumps((False, error))
     except BaseException as error:  # noqa: BLE001 - a fault of our own costs no other parcel
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        reason = f"{type(error).__name__}: {error}, {Path(frame.filename).name} line {frame.lineno}"
-        return pickle.dumps((False, WorkerError(f"a fault of vinemap's own ({reason})")))
+        where = f", {Path(frame.filename).name} line {frame.lineno}"
+        return pickle.dumps((False, WorkerError(own_fault(error, where))))
 
 
 def _limit(memory: int) -> None:
@@ -292,7 +290,6 @@ def _limit(memory: int) -> None:
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("900", encoding="ascii")
     if memory:
-        use_memory(memory)
         with contextlib.suppress(ImportError, ValueError, OSError):  # not on Windows
             import resource
 

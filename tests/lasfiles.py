@@ -1,0 +1,54 @@
+"""Small LAS, LAZ and COPC files of each kind."""
+
+from datetime import UTC, datetime
+
+import laspy
+import numpy as np
+
+FORMATS = {"las 1.2": (3, "1.2"), "las 1.4": (6, "1.4"), "laz 1.2": (3, "1.2"), "laz 1.4": (7, "1.4")}
+
+
+def points(n, seed=0):
+    return np.random.default_rng(seed).uniform([414_700, 4_940_700, 0], [414_730, 4_940_730, 3], (n, 3))
+
+
+def as_las(n, kind):
+    form, version = FORMATS[kind]
+    header = laspy.LasHeader(point_format=form, version=version)
+    header.scales = np.full(3, 0.001)
+    header.offsets = [414_700, 4_940_700, 0]
+    header.creation_date = datetime(2024, 6, 1, tzinfo=UTC)
+    las = laspy.LasData(header)
+    las.xyz = points(n)
+    return las
+
+
+def write_each(folder):
+    """Write a whole file of each kind; gives their paths."""
+    made = {}
+    for kind in FORMATS:
+        made[kind] = folder / f"{kind}.{kind[:3]}"
+        as_las(2000, kind).write(made[kind])
+    made["evlr"] = folder / "evlr.laz"
+    las = as_las(2000, "laz 1.4")
+    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("vines", 1, "of the survey", bytes(100))])
+    las.write(made["evlr"])
+    made["copc"] = folder / "copc.copc.laz"
+    try:
+        import copclib
+    except ImportError:
+        del made["copc"]
+        return made
+    low = points(2000).min(axis=0)
+    config = copclib.CopcConfigWriter(7, copclib.Vector3(0.001, 0.001, 0.001), copclib.Vector3(*np.floor(low)), "")
+    config.copc_info.halfsize, config.copc_info.spacing = 20, 10
+    writer = copclib.FileWriter(str(made["copc"]), config)
+    for x, chunk in enumerate(np.split(points(2000), 2)):
+        node = copclib.Points(writer.copc_config.las_header)
+        for xyz in chunk:
+            point = node.CreatePoint()
+            point.x, point.y, point.z = xyz
+            node.AddPoint(point)
+        writer.AddNode(copclib.VoxelKey(1, x, 0, 0), node)
+    writer.Close()
+    return made
