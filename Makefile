@@ -17,12 +17,12 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test check accuracy bench tune clean
+.PHONY: help parcel survey nightly test test-qgis check accuracy bench tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
-	@sed -nE 's/^([a-z]+):[^#]*## (.*)$$/\1 \2/p' $(firstword $(MAKEFILE_LIST)) | \
-	  while read -r verb does; do printf '  %-8s %s\n' "$$verb" "$$does"; done
+	@sed -nE 's/^([a-z-]+):[^#]*## (.*)$$/\1 \2/p' $(firstword $(MAKEFILE_LIST)) | \
+	  while read -r verb does; do printf '  %-9s %s\n' "$$verb" "$$does"; done
 
 parcel: export CONFIG ?= configs/barolo.yaml
 parcel: export PARCEL := $(PARCEL)
@@ -47,6 +47,9 @@ nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=config
 
 test: $(READY) ## Run the tests, two files at once
 	@$(BIN)/python -m pytest -n 2 --dist loadfile
+
+test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis
+	@$(BIN)/python -m pytest -n 0 tests/test_qgis.py
 
 check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check

@@ -68,6 +68,16 @@ def raster(folder: Path, parcel: str, kind: str) -> Path:
     return folder / f"{parcel}_{kind}.tif"
 
 
+def raster_style(path: Path) -> Path:
+    """Colours of a raster for QGIS, which looks for them beside it."""
+    return path.with_suffix(".qml")
+
+
+def project(folder: Path, parcel: str) -> Path:
+    """QGIS project of a product."""
+    return folder / f"{parcel}.qgz"
+
+
 def canopy_mesh(folder: Path, parcel: str) -> Path:
     """Mesh of the canopies, as glTF."""
     return folder / f"{parcel}_canopy.glb"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import geopandas as gpd
@@ -13,12 +14,13 @@ from vinemap.blocks import outline_blocks
 from vinemap.compiled import in_threads
 from vinemap.crs import project
 from vinemap.mesh import Mesh, write_glb
+from vinemap.project import project as qgis_project
 from vinemap.raster import Raster, RowField, write_cog
-from vinemap.vector import write_geopackage
+from vinemap.style import raster_style
+from vinemap.vector import conform, write_geopackage
 
 if TYPE_CHECKING:
     from datetime import datetime
-    from pathlib import Path
 
     from pyproj import CRS
 
@@ -103,7 +105,9 @@ def write_product(
     def write_rasters() -> None:
         for kind, (raster, description, unit) in rasters.items():
             how = {"description": description, "unit": unit, "resampling": "nearest" if unit == "degree" else "average"}
-            write_cog(raster, paths.raster(folder, parcel, kind), **how)
+            path = paths.raster(folder, parcel, kind)
+            write_cog(raster, path, **how)
+            paths.raster_style(path).write_text(raster_style(kind, raster.values).qml(), encoding="utf-8")
 
     def write_meshes() -> None:
         low, high = points.extent
@@ -119,4 +123,16 @@ def write_product(
     def write_layers() -> None:
         write_geopackage(layers, paths.geopackage(folder, parcel), date=date)
 
-    in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes])
+    def write_project() -> None:
+        here = Path()
+        document = qgis_project(
+            parcel,
+            {name: conform(layer, name) for name, layer in layers.items()},
+            {kind: raster for kind, (raster, _, _) in rasters.items()},
+            geopackage=f"./{paths.geopackage(here, parcel)}",
+            tif={kind: f"./{paths.raster(here, parcel, kind)}" for kind in rasters},
+            notes=[f"Survey of {date:%Y-%m-%d}", *([points.vertical] if points.vertical else [])],
+        )
+        paths.project(folder, parcel).write_bytes(document)
+
+    in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes, write_project])

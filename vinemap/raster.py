@@ -284,7 +284,7 @@ def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resamp
         "crs": raster.crs.to_wkt(),
         "transform": Affine(grid.resolution, 0, grid.west, 0, -grid.resolution, grid.north),
     }
-    options = {"compress": "DEFLATE", "predictor": "YES", "overview_resampling": resampling}
+    options = {"compress": "DEFLATE", "predictor": "YES", "blocksize": 256, "overview_resampling": resampling}
     # GDAL writes to memory and Python to the disk, as a full disk would make GDAL talk on the terminal.
     with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile() as plain, MemoryFile() as cog:
         with plain.open(**profile) as target:

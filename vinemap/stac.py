@@ -38,6 +38,8 @@ MEDIA_TYPES = {
     ".json": MediaType.JSON,
     ".las": "application/vnd.las",
     ".laz": "application/vnd.laszip",
+    ".qgz": "application/zip",
+    ".qml": MediaType.XML,
     ".tif": MediaType.COG,
 }
 RESERVED = re.compile(r"[%#?]")
@@ -99,13 +101,17 @@ def parcel_item(
     files = {
         "layers": (paths.geopackage(folder, parcel), "Rows and what belongs to them, in layers"),
         "canopy": (paths.canopy_mesh(folder, parcel), "Meshes of the canopies"),
+        "project": (paths.project(folder, parcel), "Project for QGIS, which shows the layers and rasters"),
         "classified": (paths.classified_cloud(folder, parcel), "Point cloud with a class and a row for every point"),
     }
     for key, (path, title) in files.items():
         if path.exists():
             item.add_asset(key, _asset(path, folder, title))
     for path in sorted(folder.glob("*.tif")):
-        _add_raster(item, path.stem.removeprefix(f"{parcel}_"), path)
+        kind = path.stem.removeprefix(f"{parcel}_")
+        _add_raster(item, kind, path)
+        if (style := paths.raster_style(path)).exists():
+            item.add_asset(f"{kind}_style", _asset(style, folder, "Its colours in QGIS", role="style"))
     item.add_asset("run", _asset(paths.run_record(folder), folder, "Inputs, settings and versions", role="metadata"))
     if survey:
         above = folder / ".."

@@ -1,14 +1,31 @@
-"""Styles that QGIS shows without a click: the rows of a GeoPackage's ``layer_styles`` table, as QML."""
+"""How a product looks in QGIS: the styles of its layers and rasters, and the words for its columns."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-from xml.sax.saxutils import quoteattr
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import pandas as pd
+
+from vinemap.symbology import (
+    classes_of,
+    graduated,
+    hillshade,
+    labels_at_start,
+    node,
+    pseudocolour,
+    qml,
+    ramp,
+    rgba,
+    single,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from xml.etree.ElementTree import Element
+
+    import geopandas as gpd
+    from numpy.typing import NDArray
 
 UNITS = {"m": "m", "deg": "°", "m2": "m²", "m3": "m³"}
 WORDS = {
@@ -30,25 +47,59 @@ WORDS = {
     "reduction": "Complexity reduction",
     "quality": "Quality score",
 }
+END_UNITS = {"x": "m", "y": "m", "z": "m", "lat": "°", "lon": "°", "alt": "m"}
+
+INK, PAPER, RED = "#1d2b24", "#ffffff", "#d7263d"
+VIGOUR = ("#f7f06d", "#c2e06b", "#7cc96a", "#36a463", "#10775a", "#064b4a")
+"""From little to much foliage, told apart by lightness alone as well."""
+TERRAIN = ("#3b5f4c", "#6c8c5a", "#a9b87a", "#dccfa0", "#c69f74", "#9a6b50", "#f4efe9")
+SPACINGS = ("#f6eff7", "#d0d1e6", "#a6bddb", "#67a9cf", "#1c9099", "#016c59")
+LIKELIHOODS = ("#ffffff", "#fee8c8", "#fdbb84", "#e34a33", "#7f0000")
+DIRECTIONS = ("#e0558d", "#e88a3c", "#b3b43a", "#4bb56b", "#3aa7c4", "#7377d9", "#e0558d")
+"""A round of colours, as 180° is 0°."""
+CANOPY = ("#ccd9bf", "#ccd9bf", "#a9c19b", "#84a67c", "#5f8a61", "#3c6a4b")
+LOWEST_CANOPY, HIGHEST_CANOPY = 0.5, 2.5
+"""Metres between which the canopies' height has its colours, the same in all parcels and surveys."""
+
+VOLUME_PER_METRE = 'coalesce("volume_m3" / "length_m", 0)'
+CASING = {"line_color": rgba("#1d2b24c8"), "line_width": "1.3", "capstyle": "flat"}
 SYMBOLS = {
-    "rows": ("line", "SimpleLine", {"line_color": "26,122,58,255", "line_width": "0.6", "capstyle": "round"}),
-    "gaps": ("line", "SimpleLine", {"line_color": "227,66,52,255", "line_width": "1.1", "capstyle": "flat"}),
-    "sections": ("line", "SimpleLine", {"line_color": "120,180,90,160", "line_width": "0.15"}),
-    "row_ends": ("marker", "SimpleMarker", {"color": "255,255,255,255", "outline_color": "26,122,58,255", "size": "2"}),
-    "key_points": ("marker", "SimpleMarker", {"color": "26,122,58,255", "outline_style": "no", "size": "0.9"}),
+    "rows": ("line", [CASING, {"line_width": "0.9", "capstyle": "flat"}]),
+    "gaps": ("line", [{"line_color": rgba(RED), "line_width": "1.9", "capstyle": "flat"}]),
+    "sections": ("line", [{"line_width": "0.4", "capstyle": "flat"}]),
+    "row_ends": ("marker", [{"color": rgba(PAPER), "outline_color": rgba(INK), "outline_width": "0.3", "size": "1.6"}]),
+    "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
     "parcel": (
         "fill",
-        "SimpleFill",
-        {"style": "no", "color": "255,255,255,0", "outline_color": "110,80,160,255", "outline_width": "0.5"},
+        [{"style": "no", "outline_color": rgba("#5b3f8c"), "outline_width": "0.6", "outline_style": "dash"}],
     ),
 }
-LABELS = {"rows": "label"}
-SMALLEST_SCALE = {"sections": 600, "key_points": 2500}
+SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000}
 """Layers of small things show from this scale denominator on."""
+LABEL_SCALE = 4000
+MAP_TIPS = {
+    "rows": "<b>Row [% label %]</b><br>[% round(length_m, 1) %] m, [% round(volume_m3 / length_m, 2) %] m³/m<br>"
+    "[% round(height_m, 2) %] m high, [% round(width_m, 2) %] m wide<br>missing vines: [% n_missing %]",
+    "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, missing vines: [% n_missing %]",
+    "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
+    "[% round(width_m, 2) %] m wide",
+    "row_ends": "<b>Row [% label %]</b>, end [% end %]",
+}
 
 
-def layer_styles(layers: Mapping[str, Mapping[str, str]]) -> pd.DataFrame:
-    """Table ``layer_styles`` for layers and their columns, as QGIS 3 reads it from a GeoPackage."""
+class Style(NamedTuple):
+    """A layer's definition: elements, and attributes of what holds them (a style or a project's layer)."""
+
+    body: list[Element]
+    attributes: dict[str, str]
+
+    def qml(self) -> str:
+        """The same as a style of its own."""
+        return qml(self.body, self.attributes)
+
+
+def layer_styles(layers: Mapping[str, gpd.GeoDataFrame]) -> pd.DataFrame:
+    """Table ``layer_styles`` for a GeoPackage's layers, by which QGIS 3 shows them."""
     records = [
         {
             "f_table_catalog": "",
@@ -56,7 +107,7 @@ def layer_styles(layers: Mapping[str, Mapping[str, str]]) -> pd.DataFrame:
             "f_table_name": name,
             "f_geometry_column": "geom",
             "styleName": "vinemap",
-            "styleQML": qml(name, list(columns)),
+            "styleQML": vector_style(name, table).qml(),
             "styleSLD": "",
             "useAsDefault": True,
             "description": "vinemap",
@@ -64,7 +115,7 @@ def layer_styles(layers: Mapping[str, Mapping[str, str]]) -> pd.DataFrame:
             "ui": "",
             "update_time": pd.Timestamp("2000-01-01"),
         }
-        for name, columns in layers.items()
+        for name, table in layers.items()
     ]
     return pd.DataFrame(records)
 
@@ -75,40 +126,63 @@ def alias(column: str) -> str:
         return WORDS[column]
     stem, _, unit = column.rpartition("_")
     if stem in ("e1", "en"):
-        return f"{stem} {unit}"
+        return f"{stem} {unit} ({END_UNITS[unit]})"
     words, suffix = (stem, f" ({UNITS[unit]})") if unit in UNITS else (column, "")
     return words.replace("_", " ").capitalize() + suffix
 
 
-def qml(layer: str, columns: list[str]) -> str:
-    """Style of a layer as QML."""
-    kind, symbol, properties = SYMBOLS[layer]
-    options = "".join(
-        f'<Option name={quoteattr(k)} type="QString" value={quoteattr(v)}/>' for k, v in properties.items()
-    )
-    aliases = "".join(
-        f'<alias field={quoteattr(column)} index="{k}" name={quoteattr(alias(column))}/>'
-        for k, column in enumerate(columns, start=1)
-    )
-    labelled = int(layer in LABELS)
-    scale = SMALLEST_SCALE.get(layer)
-    visibility = f'hasScaleBasedVisibilityFlag="1" minScale="{scale}" maxScale="0"' if scale else ""
-    return (
-        "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>"
-        f'<qgis version="3.22" styleCategories="AllStyleCategories" labelsEnabled="{labelled}" {visibility}>'
-        '<renderer-v2 type="singleSymbol" symbollevels="0" enableorderby="0"><symbols>'
-        f'<symbol type="{kind}" name="0" alpha="1" clip_to_extent="1" force_rhr="0">'
-        f'<layer class="{symbol}" enabled="1" locked="0" pass="0"><Option type="Map">{options}</Option></layer>'
-        f"</symbol></symbols></renderer-v2>{_labels(LABELS[layer]) if layer in LABELS else ''}"
-        f"<aliases>{aliases}</aliases></qgis>"
-    )
+def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
+    """Style of a layer of the contract; rows and sections have classes that fit their own values.
+
+    Parameters
+    ----------
+    layer : str
+        Its name.
+    table : GeoDataFrame
+        Its features.
+    """
+    symbol = SYMBOLS[layer]
+    if layer == "rows":
+        volume = (table["volume_m3"] / table["length_m"]).to_numpy()
+        renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
+    elif layer == "sections":
+        renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
+    else:
+        renderer = single(symbol)
+    columns = [str(name) for name in table.columns if name != "geometry"]
+    aliases = [node("alias", field=name, index=k, name=alias(name)) for k, name in enumerate(columns, start=1)]
+    body = [renderer, node("aliases", *aliases)]
+    attributes = {"labelsEnabled": "0"}
+    if layer == "rows":
+        # Rows are drawn in the grid's frame, and their attribute is from true east.
+        direction = "degrees(azimuth(start_point($geometry), end_point($geometry))) - 90"
+        body.append(labels_at_start("label", rotation=direction, scale=LABEL_SCALE, colour=INK))
+        attributes["labelsEnabled"] = "1"
+    if layer in MAP_TIPS:
+        body.append(node("mapTip", MAP_TIPS[layer]))
+    if "label" in columns:
+        body.append(node("previewExpression", '"label"'))
+    if layer in SMALLEST_SCALE:
+        attributes |= {"hasScaleBasedVisibilityFlag": "1", "minScale": str(SMALLEST_SCALE[layer]), "maxScale": "0"}
+    return Style(body, attributes)
 
 
-def _labels(field: str) -> str:
-    return (
-        '<labeling type="simple"><settings>'
-        f'<text-style fieldName={quoteattr(field)} fontSize="8" textColor="20,70,35,255" isExpression="0">'
-        '<text-buffer bufferDraw="1" bufferSize="0.8" bufferColor="255,255,255,255"/></text-style>'
-        '<placement placement="2" placementFlags="9" repeatDistance="0"/>'
-        '<rendering drawLabels="1" obstacle="0"/></settings></labeling>'
-    )
+def raster_style(kind: str, values: NDArray[np.floating]) -> Style:
+    """Style of a product's raster: ``dtm``, ``chm``, ``row_direction``, ``row_spacing`` or ``vineyard_likelihood``."""
+    if kind == "chm":
+        stops = [(LOWEST_CANOPY - 0.1, CANOPY[0]), *ramp(CANOPY[1:], LOWEST_CANOPY, HIGHEST_CANOPY)]
+        return Style([pseudocolour(stops, unit="m", clear=True)], {})
+    if kind == "row_direction":
+        return Style([pseudocolour(ramp(DIRECTIONS, 0, 180), unit="°")], {})
+    if kind == "vineyard_likelihood":
+        return Style([pseudocolour(ramp(LIKELIHOODS, 0, 1), unit="")], {})
+    colours, step = (TERRAIN, 1.0) if kind == "dtm" else (SPACINGS, 0.1)
+    finite = values[np.isfinite(values)]
+    low, high = np.quantile(finite, [0.02, 0.98]) if len(finite) else (0.0, 0.0)
+    low, high = np.floor(low / step) * step, np.ceil(high / step) * step
+    return Style([pseudocolour(ramp(colours, low, max(high, low + step)), unit="m")], {})
+
+
+def relief_style() -> Style:
+    """Style of the terrain as relief, beneath a map."""
+    return Style([hillshade(opacity=0.4)], {})

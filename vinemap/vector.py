@@ -127,12 +127,13 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date
 
 
 def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
+    tables = {name: conform(layers[name], name) for name in LAYERS}
     for name, layer in LAYERS.items():
         with warnings.catch_warnings():
             # An empty column of text has no type of its own to infer.
             warnings.simplefilter("ignore", UserWarning)
             pyogrio.write_dataframe(
-                conform(layers[name], name),
+                tables[name],
                 path,
                 layer=name,
                 driver="GPKG",
@@ -141,8 +142,7 @@ def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
                 layer_options={"GEOMETRY_NAME": "geom", "DESCRIPTION": layer.description},
                 append=path.exists(),
             )
-    styles = layer_styles({name: layer.columns for name, layer in LAYERS.items()})
-    pyogrio.write_dataframe(styles, path, layer="layer_styles", driver="GPKG", append=True)
+    pyogrio.write_dataframe(layer_styles(tables), path, layer="layer_styles", driver="GPKG", append=True)
 
 
 def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:

@@ -1,0 +1,124 @@
+"""Products in a real QGIS: nothing invalid, everything styled, a map that can be printed.
+
+``make test-qgis`` runs them alone. The pictures stay in ``build/qgis``.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from vinemap.parcel import map_parcel
+from vinemap.synthetic import write_survey
+
+OPEN = Path(__file__).with_name("open_in_qgis.py")
+PICTURES = Path(__file__).parents[1] / "build" / "qgis"
+PYTHONS = [os.environ.get("QGIS_PYTHON"), "/usr/bin/python3"]
+"""Pythons that QGIS may be installed for, an own choice first."""
+
+
+def run(python, *args, folder):
+    (folder / "runtime").mkdir(mode=0o700, exist_ok=True)
+    env = {"PATH": os.defpath, "HOME": str(folder), "LC_ALL": "C.UTF-8", "QT_QPA_PLATFORM": "offscreen"}
+    env |= {"XDG_RUNTIME_DIR": str(folder / "runtime")}
+    return subprocess.run([python, *map(str, args)], env=env, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def open_in_qgis(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("home")
+    found = (
+        p for p in PYTHONS if p and Path(p).exists() and not run(p, "-c", "import qgis.core", folder=folder).returncode
+    )
+    python = next(found, None)
+    if python is None:
+        pytest.skip("needs QGIS for Python: apt-get install --no-install-recommends python3-qgis, or set QGIS_PYTHON")
+    PICTURES.mkdir(parents=True, exist_ok=True)
+
+    def opened(path, name, *page):
+        done = run(python, OPEN, path, PICTURES / f"{name}.png", *page, folder=folder)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return opened
+
+
+@pytest.fixture(scope="module")
+def product(vineyard, tmp_path_factory):
+    cloud = write_survey(vineyard, tmp_path_factory.mktemp("survey"))
+    folder = tmp_path_factory.mktemp("products") / "first"
+    map_parcel(cloud, folder, parcel="Clos & Fils #3", boundary=cloud.parent / "parcels.gpkg")
+    # Nothing may lead back to where it was made.
+    return shutil.move(folder, folder.with_name("moved"))
+
+
+@pytest.fixture(scope="module")
+def layers(open_in_qgis, product):
+    seen = open_in_qgis(product / "Clos & Fils #3.gpkg", "layers")
+    assert seen["errors"] == []
+    assert seen["colours"] > 20
+    return {layer["name"]: layer for layer in seen["layers"]}
+
+
+@pytest.fixture(scope="module")
+def project(open_in_qgis, product):
+    return open_in_qgis(product / "Clos & Fils #3.qgz", "project", PICTURES / "page.png")
+
+
+def test_the_bare_geopackage_is_styled(layers):
+    assert set(layers) == {"rows", "row_ends", "key_points", "sections", "gaps", "parcel"}
+    assert all(layer["valid"] and layer["styled"] and layer["crs"] for layer in layers.values())
+    assert layers["rows"]["labels"]
+    assert layers["rows"]["renderer"] == layers["sections"]["renderer"] == "graduatedSymbol"
+    assert all("m³/m" in c["label"] for c in layers["rows"]["classes"])
+    assert layers["gaps"]["colour"] == "#d7263d"
+    assert layers["sections"]["scale"] == 800
+
+
+def test_the_bare_geopackage_explains_itself(layers):
+    assert all(layer["about"] for layer in layers.values())
+    assert layers["rows"]["aliases"]["volume_m3"] == "Volume (m³)"
+    assert layers["parcel"]["aliases"]["area_m2"] == "Area (m²)"
+    assert "missing vines" in layers["rows"]["tip"]
+
+
+def test_the_project_opens_at_the_parcel_with_everything_valid(project):
+    assert project["read"]
+    assert project["title"] == "Clos & Fils #3"
+    assert project["crs"] == "EPSG:32632"
+    assert len(project["layers"]) == 12
+    assert all(layer["valid"] and layer["crs"] for layer in project["layers"])
+    assert project["errors"] == []
+    assert project["colours"] > 200
+    assert 50 < project["drawn_at"] < 1000
+
+
+def test_the_project_has_the_styles_of_the_product(project, layers):
+    named = {layer["name"]: layer for layer in project["layers"]}
+    rows = named["Rows: canopy volume per metre"]
+    assert rows["classes"] == layers["rows"]["classes"]
+    assert rows["labels"]
+    rasters = {name: layer["renderer"] for name, layer in named.items() if layer["kind"] == "raster"}
+    assert rasters.pop("Relief") == "hillshade"
+    assert set(rasters.values()) == {"singlebandpseudocolor"}
+    assert all(layer["nodata"] == -9999 for layer in named.values() if layer["kind"] == "raster")
+
+
+def test_lines_lie_above_rasters(project):
+    kinds = [layer["kind"] for layer in project["layers"] if layer["name"] in project["visible"]]
+    assert kinds == sorted(kinds, reverse=True)
+
+
+def test_the_page_can_be_printed(project):
+    assert project["page"]
+    assert {"QgsLayoutItemMap", "QgsLayoutItemLegend", "QgsLayoutItemScaleBar"} < set(project["items"])
+    assert (PICTURES / "page.png").stat().st_size > 20_000
+
+
+def test_a_raster_alone_finds_its_colours(open_in_qgis, product):
+    seen = open_in_qgis(product / "Clos & Fils #3_chm.tif", "chm")
+    assert seen["layers"][0]["renderer"] == "singlebandpseudocolor"
+    assert seen["layers"][0]["valid"]

@@ -1,0 +1,208 @@
+"""The QGIS project of a product: its layers and rasters in groups, styled, opening at the parcel.
+
+It names the files beside it by relative paths, so that the folder can be moved and copied as it is.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from typing import TYPE_CHECKING, NamedTuple
+from xml.etree.ElementTree import Element, tostring
+
+from vinemap.crs import WGS84
+from vinemap.print_layout import print_layout
+from vinemap.style import Style, raster_style, relief_style, vector_style
+from vinemap.symbology import QGIS, node
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import geopandas as gpd
+    from pyproj import CRS
+
+    from vinemap.raster import Raster
+
+MARGIN = 0.06
+"""Share of the parcel's size that the map shows about it."""
+GEOMETRY = {"parcel": "Polygon", "row_ends": "Point", "key_points": "Point"}
+
+
+LEGEND = ("rows", "gaps", "parcel", "chm")
+
+
+class Entry(NamedTuple):
+    """A line of the layer tree."""
+
+    name: str
+    """Of the layer in the GeoPackage, or of the raster's kind; "relief" is the terrain once more."""
+    title: str
+    shown: bool = True
+
+
+TREE: dict[str, list[Entry]] = {
+    "Rows": [
+        Entry("row_ends", "Ends (zoom in)"),
+        Entry("gaps", "Gaps"),
+        Entry("rows", "Rows: canopy volume per metre"),
+    ],
+    "Details": [
+        Entry("key_points", "Key points (zoom in)", shown=False),
+        Entry("sections", "Sections: canopy height (zoom in)"),
+    ],
+    "Parcel": [Entry("parcel", "Parcel")],
+    "Canopy and terrain": [
+        Entry("chm", "Height above terrain"),
+        Entry("relief", "Relief"),
+        Entry("dtm", "Terrain elevation", shown=False),
+    ],
+    "Row field": [
+        Entry("row_direction", "Row direction, anticlockwise from east", shown=False),
+        Entry("row_spacing", "Inter-row spacing", shown=False),
+        Entry("vineyard_likelihood", "Vineyard likelihood", shown=False),
+    ],
+}
+
+
+def project(
+    title: str,
+    layers: Mapping[str, gpd.GeoDataFrame],
+    rasters: Mapping[str, Raster],
+    *,
+    geopackage: str,
+    tif: Mapping[str, str],
+    notes: Sequence[str] = (),
+) -> bytes:
+    """A QGIS project (``.qgz``).
+
+    Parameters
+    ----------
+    title : str
+        Its title.
+    layers : mapping of str to GeoDataFrame
+        The GeoPackage's layers, ``parcel`` among them.
+    rasters : mapping of str to Raster
+        The rasters by kind.
+    geopackage : str
+        Path of the GeoPackage, as seen from the project.
+    tif : mapping of str to str
+        Paths of the rasters by kind, likewise.
+    notes : sequence of str
+        Lines at the foot of the page to print.
+    """
+    crs = layers["parcel"].crs
+    drawn, groups = [], []
+    for group, entries in TREE.items():
+        members = []
+        for entry in entries:
+            if entry.name in layers:
+                source = f"{geopackage}|layername={entry.name}"
+                layer = _vector(entry, source, layers[entry.name])
+            else:
+                kind = "dtm" if entry.name == "relief" else entry.name
+                source = tif[kind]
+                style = relief_style() if entry.name == "relief" else raster_style(kind, rasters[kind].values)
+                layer = _map_layer(entry, source, style, crs, provider="gdal", type="raster")
+            drawn.append(layer)
+            members.append(_leaf(entry, source, expanded=entry.name in ("rows", "chm")))
+        shown = any(entry.shown for entry in entries)
+        state = "Qt::Checked" if shown else "Qt::Unchecked"
+        groups.append(node("layer-tree-group", *members, name=group, checked=state, expanded=int(shown)))
+    bounds = _extent(layers["parcel"])
+    extent = node("extent", *(node(name, value) for name, value in bounds.items()))
+    canvas = [node("units", "meters"), extent, node("rotation", "0"), node("destinationsrs", _srs(crs))]
+    lines = {"head": _totals(layers["parcel"]), "foot": [crs.name, *notes]}
+    listed = {entry.name: entry for group in TREE.values() for entry in group}
+    legend = [(_id(listed[name]), listed[name].title, "vector" if name in layers else "raster") for name in LEGEND]
+    root = node(
+        "qgis",
+        node("homePath", path=""),
+        node("title", title),
+        node("projectCrs", _srs(crs)),
+        node("layer-tree-group", *groups),
+        node("mapcanvas", *canvas, name="theMapCanvas", annotationsVisible=1),
+        node("projectlayers", *drawn),
+        node("ProjectViewSettings", node("DefaultViewExtent", _srs(crs), **bounds)),
+        node("properties", *_properties()),
+        node("Layouts", print_layout(title, lines, layers["parcel"].total_bounds, legend)),
+        projectname=title,
+        version=QGIS,
+    )
+    text = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n" + tostring(root, encoding="unicode")
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        # Without a date of its own it would have today's.
+        name = zipfile.ZipInfo("project.qgs", date_time=(1980, 1, 1, 0, 0, 0))
+        archive.writestr(name, text, compress_type=zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
+
+
+def _totals(parcel: gpd.GeoDataFrame) -> list[str]:
+    """The parcel in a few words."""
+    total = parcel[["n_rows", "rows_length_m", "area_m2", "n_missing"]].sum()
+    missing = int(total["n_missing"])
+    return [
+        f"{int(total['n_rows'])} rows",
+        f"{total['rows_length_m']:,.0f} m in all",
+        f"{total['area_m2'] / 1e4:.2f} ha",
+        f"{missing or 'no'} missing {'vine' if missing == 1 else 'vines'}",
+    ]
+
+
+def _vector(entry: Entry, source: str, table: gpd.GeoDataFrame) -> Element:
+    style = vector_style(entry.name, table)
+    how = {"type": "vector", "geometry": GEOMETRY.get(entry.name, "Line")}
+    return _map_layer(entry, source, style, table.crs or WGS84, provider="ogr", **how)
+
+
+def _map_layer(entry: Entry, source: str, style: Style, crs: CRS, *, provider: str, **kind: str) -> Element:
+    encoded = {"encoding": "UTF-8"} if provider == "ogr" else {}
+    return node(
+        "maplayer",
+        node("id", _id(entry)),
+        node("datasource", source),
+        node("layername", entry.title),
+        node("provider", provider, **encoded),
+        node("srs", _srs(crs)),
+        *style.body,
+        **kind,
+        **style.attributes,
+    )
+
+
+def _leaf(entry: Entry, source: str, *, expanded: bool) -> Element:
+    return node(
+        "layer-tree-layer",
+        id=_id(entry),
+        name=entry.title,
+        source=source,
+        checked="Qt::Checked" if entry.shown else "Qt::Unchecked",
+        expanded=int(expanded),
+    )
+
+
+def _id(entry: Entry) -> str:
+    return f"vinemap_{entry.name}"
+
+
+def _srs(crs: CRS) -> Element:
+    authority = crs.to_authority()
+    known = [node("authid", ":".join(authority))] if authority else []
+    return node("spatialrefsys", node("wkt", crs.to_wkt()), *known, node("description", crs.name))
+
+
+def _extent(parcel: gpd.GeoDataFrame) -> dict[str, str]:
+    west, south, east, north = parcel.total_bounds
+    margin = MARGIN * max(east - west, north - south)
+    bounds = {"xmin": west - margin, "ymin": south - margin, "xmax": east + margin, "ymax": north + margin}
+    return {name: f"{value:.2f}" for name, value in bounds.items()}
+
+
+def _properties() -> Iterator[Element]:
+    def group(name: str, values: Mapping[str, tuple[str, str]]) -> Element:
+        return node(name, *(node(key, text, type=kind) for key, (kind, text) in values.items()))
+
+    yield group("SpatialRefSys", {"ProjectionsEnabled": ("int", "1")})
+    yield group("Paths", {"Absolute": ("bool", "false")})
+    yield group("Measure", {"Ellipsoid": ("QString", "EPSG:7030")})
+    yield group("Measurement", {"DistanceUnits": ("QString", "meters"), "AreaUnits": ("QString", "ha")})
