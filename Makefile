@@ -56,8 +56,8 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff format --check
 	@$(BIN)/python -m mypy
 
-accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill README's tables: make accuracy [FAMILY="curved fan"]
-	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--readme README.md)
+accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
+	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
 	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)

@@ -379,8 +379,8 @@ def _cell(value: float, measure: Measure, eased: float | None) -> str:
 @click.option("--seeds", default=3, show_default=True, type=click.IntRange(1), help="Surveys of each family.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for a picture of each family's worst row.")
 @click.option("--markdown", is_flag=True, help="Print the tables as Markdown.")
-@click.option("--readme", type=click.Path(path_type=Path), help="Markdown file whose tables between marks are filled.")
-def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool, readme: Path | None) -> None:
+@click.option("--docs", type=click.Path(path_type=Path), help="Markdown file whose tables between marks are filled.")
+def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool, docs: Path | None) -> None:
     """Measure rows and canopies on simulated vineyards, of all families unless some are named."""
     names = families or tuple(FAMILIES)
     began = time.perf_counter()
@@ -393,11 +393,11 @@ def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool
     }
     for lines in tables.values():
         click.echo((as_markdown if markdown else as_text)(lines) + "\n")
-    if readme:
-        text = readme.read_text(encoding="utf-8")
+    if docs:
+        text = docs.read_text(encoding="utf-8")
         for name, lines in tables.items():
             text = fill(text, name, as_markdown(lines))
-        readme.write_text(text, encoding="utf-8")
+        docs.write_text(text, encoding="utf-8")
     missed = sum(cell.count("!") for lines in tables.values() for line in lines[1:] for cell in line)
     click.echo(
         f"{missed} values miss their bars (!); surveys: {len(names) * seeds}, in {time.perf_counter() - began:.0f} s",

@@ -1,0 +1,52 @@
+"""The documentation says what is so: its links, commands, columns and defaults."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from vinemap.cli import commands
+from vinemap.template import template
+from vinemap.vector import LAYERS
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def text(name):
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    missing = [link for link in links if ":" not in link and not (page.parent / link).exists()]
+    assert missing == []
+
+
+def test_every_page_is_reached_from_the_readme():
+    readme = PAGES[0].read_text(encoding="utf-8")
+    assert [page.name for page in PAGES[1:] if f"docs/{page.name}" not in readme] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_exist(page):
+    written = page.read_text(encoding="utf-8")
+    code = "\n".join(re.findall(r"```sh\n(.*?)```", written, re.DOTALL) + re.findall(r"`([^`\n]+)`", written))
+    verbs = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(re.findall(r"^make ([a-z-]+)", code, re.MULTILINE)) <= verbs
+    for name, line in re.findall(r"^(?:\.venv/bin/)?vinemap ([a-z]+)(.*)", code, re.MULTILINE):
+        assert name in commands.commands
+        options = {flag for option in commands.commands[name].params for flag in option.opts}
+        assert set(re.findall(r"--[a-z-]+", line.split("#")[0])) <= options
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_every_column_is_described(layer):
+    section = re.search(rf"### Layer `{layer}`.*?(?=\n##|\Z)", text("products.md"), re.DOTALL)[0]
+    firsts = [line.split("|")[1] for line in section.splitlines() if line.startswith("|")]
+    assert set(re.findall(r"`(\w+)`", " ".join(firsts))) == set(LAYERS[layer].columns)
+
+
+def test_every_key_is_described():
+    assert f"```yaml\n{template('survey')}```" in text("configuration.md"), "vinemap config survey has changed"
