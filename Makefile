@@ -17,7 +17,7 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test test-qgis check accuracy bench tune clean
+.PHONY: help parcel survey nightly test test-qgis check accuracy bench picture tune clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -61,6 +61,9 @@ accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill doc
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
 	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
+
+picture: $(READY) ## Draw README's picture of a product: make parcel PARCEL=curved picture
+	@$(BIN)/python -m vinemap.picture data/products/barolo/$(or $(PARCEL),curved) $(or $(PARCEL),curved) docs/picture.png
 
 tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
 	@$(BIN)/python -m vinemap.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")

@@ -82,6 +82,7 @@ MAY_IMPORT = {
     "bench_jobs": CHAIN | {"parcel"},
     "bench": {"errors", "paths", "tables", "processes", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
+    "picture": {"paths", "style", "mesh_files"},
     "cli": CHAIN | {"parcel", "plan", "survey", "template"},
     "__main__": {"cli"},
     "flows": CHAIN | {"parcel", "recipe", "plan", "survey", "estate", "processes", "cli", "flows"},

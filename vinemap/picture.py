@@ -6,29 +6,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import geopandas as gpd
 import matplotlib as mpl
 import numpy as np
 import rasterio
+import shapely
 
 from vinemap import paths
+from vinemap.mesh_files import read_glb
 from vinemap.style import CANOPY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-SIZE = (12.0, 4.6)
-SUN = np.array([-0.5, 0.35, 0.79])
-TILT = 34.0
+SIZE = (12.0, 4.0)
+SUN = np.array([-0.62, -0.3, 0.72])
+TILT = 42.0
 """Degrees above the horizon from which the meshes are seen."""
 TURN = -24.0
 """Degrees by which they are turned, anticlockwise."""
-FOLIAGE, SOIL = np.array([0.36, 0.60, 0.30]), np.array([0.86, 0.80, 0.70])
-TERRAIN_STEP = 4
+FOLIAGE, SOIL = np.array([0.45, 0.68, 0.33]), np.array([0.93, 0.88, 0.80])
+TERRAIN_STEP = 2
 """Cells of the DTM a facet of the ground."""
 
 
@@ -50,7 +52,7 @@ def draw(product: Path, parcel: str, path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=SIZE, width_ratios=(1, 1.15), layout="constrained")
     _map(left, product, parcel)
     _scene(right, product, parcel)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)
 
 
@@ -61,8 +63,12 @@ def _map(axes: Axes, product: Path, parcel: str) -> None:
     from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
 
     relief = LightSource(azdeg=315, altdeg=45).hillshade(dtm, vert_exag=2, dx=0.25, dy=0.25)
-    axes.imshow(relief, extent=where, cmap="gray", vmin=-0.6, vmax=1.1)
-    heights = np.ma.masked_less(chm, LOWEST_CANOPY)
+    outline = layers["parcel"].union_all()
+    x = np.linspace(*where[:2], chm.shape[1])
+    y = np.linspace(*where[:1:-1], chm.shape[0])
+    inside = shapely.contains_xy(outline, *np.meshgrid(x, y))
+    axes.imshow(np.where(inside, relief, np.nan), extent=where, cmap="gray", vmin=-1.2, vmax=1.0)
+    heights = np.where(inside & (chm > LOWEST_CANOPY), chm, np.nan)
     canopy = LinearSegmentedColormap.from_list("canopy", CANOPY[1:])
     axes.imshow(heights, extent=where, cmap=canopy, vmin=LOWEST_CANOPY, vmax=HIGHEST_CANOPY, interpolation="none")
     rows = layers["rows"]
@@ -97,7 +103,7 @@ def _scene(axes: Axes, product: Path, parcel: str) -> None:
     colours = np.concatenate([np.broadcast_to(colour, (len(at), 3)) for at, colour in facets])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    light = 0.55 + 0.45 * np.clip(normals @ SUN / np.where(lengths > 0, lengths, 1), 0, 1)
+    light = 0.5 + 0.5 * np.clip(normals @ SUN / np.where(lengths > 0, lengths, 1), 0, 1)
     tilt, turn = np.radians([TILT, TURN])
     middle = corners.reshape(-1, 3).mean(axis=0)
     x, y, z = np.moveaxis(corners - middle, 2, 0)
@@ -125,24 +131,14 @@ def _ground(product: Path, parcel: str) -> Facets:
     grid = np.dstack([*np.meshgrid(x, y), values[::TERRAIN_STEP, ::TERRAIN_STEP]])
     nw, ne, sw, se = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
     corners = np.concatenate([np.stack(t, axis=2).reshape(-1, 3, 3) for t in ((nw, sw, se), (nw, se, ne))])
-    import shapely
-
     inside = shapely.contains_xy(outline, *corners.mean(axis=1)[:, :2].T)
     return corners[inside & np.isfinite(corners).all(axis=(1, 2))], SOIL
 
 
 def _canopies(product: Path, parcel: str) -> Facets:
-    import trimesh
-
-    scene: Any = trimesh.load(paths.canopy_mesh(product, parcel), force="scene")
-    origin = np.array(scene.graph.get("canopy")[0]) * 0 + _origin(scene)
-    mesh = scene.to_mesh()
-    east, up, south = mesh.vertices.T
-    return (np.column_stack([east, -south, up]) + origin)[mesh.faces], FOLIAGE
-
-
-def _origin(scene: Any) -> NDArray[np.float64]:
-    return np.array(scene.graph.transforms.node_data["canopy"]["metadata"]["origin"])
+    """Triangles (n, 3, 3) of the canopies, and their colour."""
+    meshes = read_glb(paths.canopy_mesh(product, parcel)).meshes
+    return np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), FOLIAGE
 
 
 @click.command()
