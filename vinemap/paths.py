@@ -73,6 +73,11 @@ def canopy_mesh(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_canopy.glb"
 
 
+def tileset(folder: Path) -> Path:
+    """3D Tiles: of a parcel in its product's folder, of a survey in that of its products."""
+    return folder / "tileset.json"
+
+
 def classified_cloud(folder: Path, parcel: str) -> Path:
     """Cloud of a parcel with a class and a row for every point."""
     return folder / f"{parcel}_classified.laz"
