@@ -7,6 +7,7 @@ https://docs.ogc.org/cs/22-025r4/22-025r4.html
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import warnings
@@ -38,8 +39,8 @@ STEP = 10.0
 PAD = 0.01
 """Metres by which a volume is larger than what it holds, whose vertices are rounded to millimetres."""
 MOST_CHILDREN = 16
-RADIUS = 6_356_752.0
-"""Metres, the ellipsoid's least."""
+FRAME = np.eye(3)
+CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 class Geoid(NamedTuple):
@@ -156,9 +157,9 @@ def parcel_tileset(
     found = find_geoid(vertical, crs, origin, given=geoid)
     matrix = placement(origin, crs, found)
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    placed: Points = (vertices - np.asarray(origin)) @ matrix[:3, :3].T + matrix[:3, 3]
-    error = np.linalg.norm(placed - to_globe(vertices, crs, found), axis=1).max()
-    region = _region(placed)
+    local: Points = vertices - np.asarray(origin)
+    error = np.linalg.norm(_moved(local, matrix) - to_globe(vertices, crs, found), axis=1).max()
+    box = _enclose(local)
     extras = {
         "generator": f"vinemap {vinemap.__version__}",
         "crs": crs.to_string(),
@@ -169,10 +170,10 @@ def parcel_tileset(
     }
     return {
         "asset": {"version": "1.1", "extras": extras},
-        "geometricError": _span(region),
+        "geometricError": _span(box),
         "root": {
             "transform": matrix.T.round(10).ravel().tolist(),
-            "boundingVolume": {"region": region},
+            "boundingVolume": {"box": box.ravel().tolist()},
             "geometricError": 0.0,
             "refine": "ADD",
             "content": {"uri": quote(content)},
@@ -191,11 +192,13 @@ def survey_tileset(tilesets: Sequence[Path]) -> dict[str, Any] | None:
     tiles = []
     for path in tilesets:
         try:
-            known = json.loads(path.read_text(encoding="utf-8"))
-            volume, error = known["root"]["boundingVolume"], known["geometricError"]
-            tiles.append(_Tile(np.array(volume["region"], dtype=float).reshape(6), error, path))
+            root = json.loads(path.read_text(encoding="utf-8"))["root"]
+            box = np.array(root["boundingVolume"]["box"], dtype=float).reshape(4, 3)
+            matrix = np.array(root["transform"], dtype=float).reshape(4, 4).T
         except (OSError, ValueError, KeyError, TypeError):
             continue
+        uri = f"{quote(path.parent.name)}/{quote(path.name)}"
+        tiles.append(_Tile(np.vstack([_moved(box[:1], matrix), box[1:] @ matrix[:3, :3].T]), uri))
     if not tiles:
         return None
     root = _gather(tiles) | {"refine": "ADD"}
@@ -204,51 +207,56 @@ def survey_tileset(tilesets: Sequence[Path]) -> dict[str, Any] | None:
 
 
 class _Tile(NamedTuple):
-    region: Points
-    error: float
-    path: Path
+    box: Points
+    """Centre and half axes (4, 3) on the globe."""
+    uri: str
 
 
 def _gather(tiles: Sequence[_Tile]) -> dict[str, Any]:
-    """A tile of tiles: many are first sorted into columns and rows of a grid."""
+    """A tile of tiles; many are put together first by columns and rows of a grid."""
+    axes = _east_north_up(np.mean([tile.box[0] for tile in tiles], axis=0))
+    corners = np.concatenate([tile.box[0] + CORNERS @ tile.box[1:] for tile in tiles])
+    box = _enclose(corners, axes)
     children: list[dict[str, Any]]
     if len(tiles) <= MOST_CHILDREN:
-        children = [
-            {
-                "boundingVolume": {"region": tile.region.tolist()},
-                "geometricError": tile.error,
-                "content": {"uri": f"{quote(tile.path.parent.name)}/{quote(tile.path.name)}"},
-            }
-            for tile in tiles
-        ]
+        children = [_node(tile.box) | {"content": {"uri": tile.uri}} for tile in tiles]
     else:
-        side = math.isqrt(MOST_CHILDREN)
-        columns = _split(tiles, axis=0, n=side)
-        children = [_gather(cell) for column in columns for cell in _split(column, axis=1, n=side)]
-    regions = np.array([child["boundingVolume"]["region"] for child in children])
-    region = [*regions[:, :2].min(axis=0), *regions[:, 2:4].max(axis=0), regions[:, 4].min(), regions[:, 5].max()]
-    error = max(_span(region), *(child["geometricError"] for child in children))
-    return {"boundingVolume": {"region": region}, "geometricError": error, "children": children}
+        n = math.isqrt(MOST_CHILDREN)
+        cells = [cell for column in _split(tiles, n, axes[0]) for cell in _split(column, n, axes[1])]
+        children = [_gather(cell) for cell in cells]
+    return _node(box) | {"children": children}
 
 
-def _split(tiles: Sequence[_Tile], *, axis: int, n: int) -> list[list[_Tile]]:
-    """Tiles in n parts of as many, one behind the other along an axis (0 west to east, 1 south to north)."""
-    order = sorted(tiles, key=lambda tile: tile.region[axis] + tile.region[axis + 2])
+def _node(box: Points) -> dict[str, Any]:
+    return {"boundingVolume": {"box": box.round(4).ravel().tolist()}, "geometricError": _span(box)}
+
+
+def _split(tiles: Sequence[_Tile], n: int, axis: Points) -> list[list[_Tile]]:
+    """Tiles in n parts of as many, one behind the other along an axis."""
+    order = sorted(tiles, key=lambda tile: float(tile.box[0] @ axis))
     return [order[len(order) * k // n : len(order) * (k + 1) // n] for k in range(n)]
 
 
-def _region(points: Points) -> list[float]:
-    """West, south, east, north (radians) and least and greatest ellipsoidal height (m) of points on the globe."""
-    lon, lat, height = transformer(GEOCENTRIC, GEODETIC).transform(*points.T)
-    lon, lat = np.radians(lon), np.radians(lat)
-    up = PAD / RADIUS
-    side = up / np.cos(np.abs(lat).max())
-    sides = [lon.min() - side, lat.min() - up, lon.max() + side, lat.max() + up]
-    return [*np.round(sides, 12).tolist(), round(height.min() - PAD, 3), round(height.max() + PAD, 3)]
+def _moved(points: Points, matrix: Points) -> Points:
+    moved: Points = points @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
 
 
-def _span(region: Sequence[float]) -> float:
-    """Metres across a region."""
-    west, south, east, north, low, high = region
-    wide, long = RADIUS * (east - west) * math.cos((south + north) / 2), RADIUS * (north - south)
-    return round(math.hypot(wide, long, high - low), 1)
+def _enclose(points: Points, axes: Points = FRAME) -> Points:
+    """Centre and half axes (4, 3) of the box along three axes, in rows, around points (n, 3)."""
+    along = points @ axes.T
+    low, high = along.min(axis=0) - PAD, along.max(axis=0) + PAD
+    return np.vstack([(low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes]).round(4)
+
+
+def _east_north_up(point: Points) -> Points:
+    """Axes (3, 3), in rows, of the topocentric frame at a point on the globe."""
+    lon, lat, _ = transformer(GEOCENTRIC, GEODETIC).transform(point[0], point[1], point[2], radians=True)
+    east = [-math.sin(lon), math.cos(lon), 0.0]
+    up = [math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)]
+    return np.array([east, np.cross(up, east), up])
+
+
+def _span(box: Points) -> float:
+    """Metres across a box."""
+    return round(2 * float(np.linalg.norm(box[1:])), 1)
