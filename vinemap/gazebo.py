@@ -120,13 +120,11 @@ def terrain_mesh(dtm: Path, origin: Origin, *, cell: float = TERRAIN_CELL) -> Me
         with rasterio.open(dtm) as source:
             ny, nx = (max(2, round(n * source.res[0] / cell)) for n in source.shape)
             z = source.read(1, out_shape=(ny, nx), masked=True, resampling=Resampling.average).filled(np.nan)
-            crs, transform = (
-                CRS(source.crs),
-                source.transform * source.transform.scale(source.width / nx, source.height / ny),
-            )
+            crs, (west, south, east, north) = CRS(source.crs), source.bounds
     except RasterioIOError as error:
         raise InputError(f"{dtm}: can't be read: map the parcel anew") from error
-    x, y = transform * (np.arange(nx) + 0.5, np.arange(ny)[:, None] + 0.5)
+    x = west + (east - west) * (np.arange(nx) + 0.5) / nx
+    y = north - (north - south) * (np.arange(ny)[:, None] + 0.5) / ny
     at = np.arange(ny * nx).reshape(ny, nx)
     nw, ne, sw, se = (corner.ravel() for corner in (at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]))
     faces = np.concatenate([np.column_stack([nw, sw, se]), np.column_stack([nw, se, ne])])

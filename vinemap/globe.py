@@ -215,8 +215,6 @@ class _Tile(NamedTuple):
 def _gather(tiles: Sequence[_Tile]) -> dict[str, Any]:
     """A tile of tiles; many are put together first by columns and rows of a grid."""
     axes = _east_north_up(np.mean([tile.box[0] for tile in tiles], axis=0))
-    corners = np.concatenate([tile.box[0] + CORNERS @ tile.box[1:] for tile in tiles])
-    box = _enclose(corners, axes)
     children: list[dict[str, Any]]
     if len(tiles) <= MOST_CHILDREN:
         children = [_node(tile.box) | {"content": {"uri": tile.uri}} for tile in tiles]
@@ -224,7 +222,9 @@ def _gather(tiles: Sequence[_Tile]) -> dict[str, Any]:
         n = math.isqrt(MOST_CHILDREN)
         cells = [cell for column in _split(tiles, n, axes[0]) for cell in _split(column, n, axes[1])]
         children = [_gather(cell) for cell in cells]
-    return _node(box) | {"children": children}
+    boxes = np.reshape([child["boundingVolume"]["box"] for child in children], (-1, 4, 3))
+    corners = boxes[:, :1] + CORNERS @ boxes[:, 1:]
+    return _node(_enclose(corners.reshape(-1, 3), axes)) | {"children": children}
 
 
 def _node(box: Points) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -51,7 +52,7 @@ def read_glb(path: Path) -> Canopies:
         meshes = [_read_row(document, node, origin) for node in nodes]
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, struct.error) as error:
         raise InputError(f"{path}: isn't a mesh of vinemap's: give the .glb of a product") from error
     return Canopies(meshes, crs, vertical, origin)
 

@@ -161,8 +161,7 @@ class ProductOptions(Options):
         None,
         ge=-120,
         le=120,
-        description="height of the geoid above the ellipsoid there, added to heights on the globe (m); "
-        "none: from PROJ's grids where they are installed, else 0",
+        description="height of the geoid above the ellipsoid, added on the globe (m); none: PROJ's grids, else 0",
     )
 
 
