@@ -16,7 +16,8 @@ from pyproj import CRS, Transformer
 from vinemap import paths
 from vinemap.config import survey_config
 from vinemap.crs import to_wgs84
-from vinemap.globe import find_geoid, parcel_tileset, survey_tileset
+from vinemap.geoid import find_geoid
+from vinemap.globe import parcel_tileset, survey_tileset
 from vinemap.mesh import Mesh, loft, write_glb
 from vinemap.settings import Settings
 from vinemap.survey import _write_tileset, map_survey
@@ -213,8 +214,9 @@ def test_heights_follow_an_installed_geoid(tmp_path, egm96):
 
 
 def test_a_geoid_that_ends_elsewhere_is_none(egm96):
-    there = np.array([500_000.0, 5_500_000.0, 100.0])
-    assert "no geoid grid" in find_geoid("EGM96 height", UTM, there).source
+    for there in ([[500_000.0, 5_500_000.0, 100.0]], [PLACE, PLACE + [0, 300_000, 0]]):
+        assert "no geoid grid" in find_geoid("EGM96 height", UTM, there).source
+    assert "no geoid grid" not in find_geoid("EGM96 height", UTM, PLACE).source
 
 
 # Surveys

@@ -10,25 +10,23 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 from pyproj import CRS
-from pyproj.crs import CompoundCRS
-from pyproj.exceptions import CRSError
-from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 import vinemap
-from vinemap.crs import is_ellipsoidal, to_wgs84, transformer
+from vinemap.crs import to_wgs84, transformer
+from vinemap.geoid import find_geoid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.geoid import Geoid
     from vinemap.mesh import Mesh
 
     Points = NDArray[np.float64]
@@ -41,68 +39,6 @@ PAD = 0.01
 MOST_CHILDREN = 16
 FRAME = np.eye(3)
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-
-
-class Geoid(NamedTuple):
-    """What is added to heights to make them ellipsoidal."""
-
-    height: Callable[[Points], Points]
-    """Metres of the geoid above the ellipsoid (n,) at points (n, 3) of the CRS."""
-    source: str
-    """Where it is from, in words."""
-
-
-def find_geoid(vertical: str | None, crs: CRS, at: ArrayLike, *, given: float | None = None) -> Geoid:
-    """Choose the geoid for heights above a vertical datum.
-
-    Parameters
-    ----------
-    vertical : str or None
-        Name of the vertical datum.
-    crs : CRS
-        The horizontal, projected CRS.
-    at : array_like of shape (3,)
-        A point in it, for which the best of PROJ's grids is chosen.
-    given : float, optional
-        Height of the geoid above the ellipsoid, m, which counts before all others. Without it PROJ's grids do, and
-        where none is installed the heights stay as they are.
-    """
-    if given is not None:
-        return _level(given, "the setting product.geoid")
-    if vertical is None:
-        return _level(0.0, "none: the cloud states no vertical datum, its heights are taken as they are")
-    if is_ellipsoidal(vertical):
-        return _level(0.0, "none: the cloud's heights are ellipsoidal")
-    try:
-        datum = CRS.from_user_input(vertical)
-    except CRSError:
-        datum = None
-    if datum is None or not datum.is_vertical or datum.name != vertical:
-        return _level(0.0, f"none: PROJ doesn't know {vertical!r}, heights are taken as they are")
-    lat, lon, _ = to_wgs84(at, crs)[0]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of grids that are missing
-        group = TransformerGroup(
-            CompoundCRS(vertical, [crs, datum]),
-            GEODETIC,
-            always_xy=True,
-            area_of_interest=AreaOfInterest(lon, lat, lon, lat),
-        )
-    for transform in group.transformers:
-        # A ballpark transformation, which leaves heights alone, is of no known accuracy (and at times the best of all).
-        if transform.accuracy < 0:
-            continue
-
-        def height(points: Points, convert: Callable[..., Any] = transform.transform) -> Points:
-            return np.asarray(convert(points[:, 0], points[:, 1], np.zeros(len(points)))[2])
-
-        if np.isfinite(height(np.atleast_2d(at))).all():
-            return Geoid(height, f"PROJ: {transform.description} (to {transform.accuracy:g} m)")
-    return _level(0.0, f"none: PROJ has no geoid grid for {vertical!r} installed, heights are taken as they are")
-
-
-def _level(metres: float, source: str) -> Geoid:
-    return Geoid(lambda points: np.full(len(points), metres), source)
 
 
 def to_globe(xyz: ArrayLike, crs: CRS, geoid: Geoid) -> Points:
@@ -149,14 +85,15 @@ def parcel_tileset(
     crs : CRS
         The horizontal, projected CRS.
     vertical, geoid : str, float, optional
-        As for :func:`find_geoid`.
+        As for :func:`vinemap.geoid.find_geoid`.
     """
     meshes = [mesh for mesh in meshes if len(mesh.faces)]
     if not meshes:
         return None
-    found = find_geoid(vertical, crs, origin, given=geoid)
-    matrix = placement(origin, crs, found)
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    ends = np.vstack([origin, vertices.min(axis=0), vertices.max(axis=0)])
+    found = find_geoid(vertical, crs, ends, given=geoid)
+    matrix = placement(origin, crs, found)
     local: Points = vertices - np.asarray(origin)
     error = np.linalg.norm(_moved(local, matrix) - to_globe(vertices, crs, found), axis=1).max()
     box = _enclose(local)

@@ -89,7 +89,7 @@ def write_product(
     """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
 
     The ``date`` is the survey's. ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the
-    globe, m (:func:`vinemap.globe.find_geoid`).
+    globe, m (:func:`vinemap.geoid.find_geoid`).
 
     Raises
     ------
