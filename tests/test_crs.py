@@ -77,6 +77,8 @@ def test_units_and_datums_of_heights():
     assert vertical_unit(parse_crs("EPSG:4979")) == 1.0
     assert vertical_name(parse_crs("EPSG:25832+7837")) == "DHHN2016 height"
     assert vertical_name(parse_crs("EPSG:32632")) is None
+    assert vertical_name(parse_crs("EPSG:4979")) == "ellipsoidal height"
+    assert vertical_name(parse_crs("EPSG:32632").to_3d()) == "ellipsoidal height"
 
 
 def test_unknown_crs_is_named():

@@ -66,7 +66,7 @@ def test_missing_vines_are_gaps(product, vineyard):
 def test_product_is_the_contracts(product):
     folder = product.folder
     record = json.loads((folder / "run.json").read_text())
-    expected = {"A.gpkg", "A.qgz", "A_canopy.glb", "A_stac.json"}
+    expected = {"A.gpkg", "A.qgz", "A_canopy.glb", "A_stac.json", "tileset.json"}
     expected |= {f"A_{kind}.{suffix}" for kind in RASTERS for suffix in ("tif", "qml")}
     assert {p.name for p in folder.iterdir()} == expected | {"run.json"}
     assert set(record["files"]) == expected
@@ -154,6 +154,7 @@ def test_nothing_is_a_product_of_empty_layers(tmp_path):
     for kind in RASTERS:
         assert paths.raster(tmp_path / "out", "meadow", kind).is_file()
     assert len(pygltflib.GLTF2().load(paths.canopy_mesh(tmp_path / "out", "meadow")).nodes) == 1
+    assert not paths.tileset(tmp_path / "out").exists()
 
 
 def test_bad_input_leaves_nothing(tmp_path, survey):

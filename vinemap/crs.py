@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 WGS84 = CRS.from_epsg(4326)
+ELLIPSOIDAL = "ellipsoidal height"
+"""What stands for the vertical datum of a CRS whose third axis is the height above its ellipsoid."""
 SCALE_TOLERANCE = 0.002
 """A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
 
@@ -84,7 +86,14 @@ def horizontal(crs: CRS) -> CRS:
 
 def vertical_name(crs: CRS) -> str | None:
     """Name of the vertical datum that a CRS states, or None."""
-    return crs.sub_crs_list[1].name if crs.is_compound else None
+    if crs.is_compound:
+        return crs.sub_crs_list[1].name
+    return ELLIPSOIDAL if len(crs.axis_info) > 2 else None
+
+
+def is_ellipsoidal(vertical: str) -> bool:
+    """Whether a vertical datum, by its name, is the ellipsoid."""
+    return "ellipsoid" in vertical.lower()
 
 
 def vertical_unit(crs: CRS) -> float:

@@ -279,7 +279,7 @@ def follow(
         }
 
         def write() -> None:
-            how: dict[str, Any] = {"date": recipe.flown, "plain": settings.product.plain}
+            how: dict[str, Any] = {"date": recipe.flown} | settings.product.model_dump(include={"plain", "geoid"})
             write_product(draft, parcel, layers, (seen.dtm, seen.chm), seen.field, meshes, points, **how)
             if settings.product.classified:
                 classify = partial(classify_points, leaves=_leaves(seen, settings))

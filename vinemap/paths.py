@@ -83,6 +83,21 @@ def canopy_mesh(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_canopy.glb"
 
 
+def exported_mesh(folder: Path, parcel: str, kind: str) -> Path:
+    """Mesh of the canopies in another format ("ply", "obj")."""
+    return folder / f"{parcel}_canopy.{kind}"
+
+
+def exported_frame(folder: Path, parcel: str) -> Path:
+    """Frame of such a mesh."""
+    return folder / f"{parcel}_canopy_frame.json"
+
+
+def tileset(folder: Path) -> Path:
+    """3D Tiles: of a parcel in its product's folder, of a survey in that of its products."""
+    return folder / "tileset.json"
+
+
 def classified_cloud(folder: Path, parcel: str) -> Path:
     """Cloud of a parcel with a class and a row for every point."""
     return folder / f"{parcel}_classified.laz"

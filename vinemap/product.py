@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from vinemap import paths
 from vinemap.blocks import outline_blocks
 from vinemap.compiled import in_threads
 from vinemap.crs import project
+from vinemap.globe import parcel_tileset
 from vinemap.mesh import Mesh, write_glb
 from vinemap.project import project as qgis_project
 from vinemap.raster import Raster, RowField, write_cog
@@ -84,10 +86,12 @@ def write_product(
     *,
     date: datetime,
     plain: bool = False,
+    geoid: float | None = None,
 ) -> None:
     """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
 
-    The ``date`` is the survey's. ``plain`` meshes need no extension of glTF.
+    The ``date`` is the survey's. ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the
+    globe, m (:func:`vinemap.geoid.find_geoid`).
 
     Raises
     ------
@@ -109,16 +113,14 @@ def write_product(
             write_cog(raster, path, **how)
             paths.raster_style(path).write_text(raster_style(kind, raster.values).qml(), encoding="utf-8")
 
+    canopy, origin = paths.canopy_mesh(folder, parcel), np.round(np.mean(points.extent, axis=0))
+    where: dict[str, Any] = {"origin": origin, "crs": points.crs, "vertical": points.vertical, "geoid": geoid}
+    if tileset := parcel_tileset(meshes, canopy.name, **where):
+        paths.tileset(folder).write_text(json.dumps(tileset, indent=1), encoding="utf-8")
+
     def write_meshes() -> None:
-        low, high = points.extent
-        write_glb(
-            meshes,
-            paths.canopy_mesh(folder, parcel),
-            origin=tuple(np.round((low + high) / 2).tolist()),
-            crs=points.crs.to_string(),
-            extras={"vertical": points.vertical},
-            plain=plain,
-        )
+        extras = {"vertical": points.vertical}
+        write_glb(meshes, canopy, origin=origin, crs=points.crs.to_string(), extras=extras, plain=plain)
 
     def write_layers() -> None:
         write_geopackage(layers, paths.geopackage(folder, parcel), date=date)

@@ -157,6 +157,12 @@ class ProductOptions(Options):
 
     classified: bool = Field(default=False, description="the cloud with a class and a row for every point, as LAZ")
     plain: bool = Field(default=False, description="meshes for readers of glTF that know no extension: larger files")
+    geoid: float | None = Field(
+        None,
+        ge=-120,
+        le=120,
+        description="height of the geoid above the ellipsoid, added on the globe (m); none: PROJ's grids, else 0",
+    )
 
 
 class Settings(Options):

@@ -102,6 +102,7 @@ def parcel_item(
         "layers": (paths.geopackage(folder, parcel), "Rows and what belongs to them, in layers"),
         "canopy": (paths.canopy_mesh(folder, parcel), "Meshes of the canopies"),
         "project": (paths.project(folder, parcel), "Project for QGIS, which shows the layers and rasters"),
+        "tileset": (paths.tileset(folder), "Meshes of the canopies on the globe, as 3D Tiles"),
         "classified": (paths.classified_cloud(folder, parcel), "Point cloud with a class and a row for every point"),
     }
     for key, (path, title) in files.items():
@@ -159,7 +160,7 @@ def _collect(item: pystac.Item, survey: str, href: str) -> None:
 
 def write_collection(
     folder: Path, *, survey: str, flown: datetime, sources: Sequence[tuple[Path, Mapping[str, Any]]]
-) -> None:
+) -> list[Path]:
     """Write a survey's collection of all parcels' items that are in a folder, and the item of the survey.
 
     The survey's item tells what its parcels were mapped from. Cloud and boundaries may be anywhere and stay behind when
@@ -177,6 +178,11 @@ def write_collection(
     sources : sequence of (Path, mapping)
         Cloud, and boundaries if there are any, each with its size in ``bytes`` and its ``sha256``.
 
+    Returns
+    -------
+    list of Path
+        Folders of the products in it.
+
     Raises
     ------
     OSError
@@ -187,7 +193,7 @@ def write_collection(
     if not parcels:
         whole.unlink(missing_ok=True)
         own.unlink(missing_ok=True)
-        return
+        return []
     boxes = np.array([parcel.bbox for parcel in parcels])
     bbox = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
     flown = flown.astimezone(UTC)
@@ -214,6 +220,7 @@ def write_collection(
     collection.add_links([Link(RelType.ITEM, _href(path, folder), MediaType.GEOJSON, title) for title, path in items])
     save(item, own)
     save(collection, whole)
+    return [parcel.path.parent for parcel in parcels]
 
 
 class _Parcel(NamedTuple):

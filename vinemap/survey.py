@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextvars
+import json
 import time
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from datetime import UTC, datetime
@@ -10,13 +11,14 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
-from vinemap import machine
+from vinemap import machine, paths
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
+from vinemap.globe import survey_tileset
 from vinemap.parcel import call, follow
 from vinemap.pieces import split_cloud
 from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
 from vinemap.stac import write_collection
-from vinemap.store import unwritable, workshop
+from vinemap.store import unwritable, workshop, write_whole
 from vinemap.workers import Worker, Workers
 
 if TYPE_CHECKING:
@@ -97,7 +99,16 @@ def map_survey(
             if outcomes:
                 write_record(folder, config.survey, plan, outcomes, began)
                 given = [(source.path, source.record()) for source in plan.sources]
-                write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
+                products = write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
+                _write_tileset(paths.tileset(folder), products)
+
+
+def _write_tileset(path: Path, products: Sequence[Path]) -> None:
+    """Write the 3D Tiles of all products, or none."""
+    if tileset := survey_tileset([paths.tileset(product) for product in products]):
+        write_whole(path, json.dumps(tileset))
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
