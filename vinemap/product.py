@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from vinemap.style import raster_style
 from vinemap.vector import conform, write_geopackage
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from datetime import datetime
 
     from pyproj import CRS
@@ -29,6 +31,16 @@ if TYPE_CHECKING:
     from vinemap.tiles import Cloud
 
     Boundary = tuple[shapely.Geometry, CRS]
+
+
+RASTERS = {
+    "dtm": ("Terrain elevation", "m"),
+    "chm": ("Height above terrain", "m"),
+    "row_direction": ("Row direction, anticlockwise from east", "degree"),
+    "row_spacing": ("Inter-row spacing", "m"),
+    "vineyard_likelihood": ("Vineyard likelihood", "1"),
+}
+"""Rasters of a product: what they hold, and its unit."""
 
 
 def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
@@ -98,43 +110,51 @@ def write_product(
     OSError
         If one can't be written.
     """
-    rasters = {
-        "dtm": (surfaces[0], "Terrain elevation", "m"),
-        "chm": (surfaces[1], "Height above terrain", "m"),
-        "row_direction": (field.direction, "Row direction, anticlockwise from east", "degree"),
-        "row_spacing": (field.spacing, "Inter-row spacing", "m"),
-        "vineyard_likelihood": (field.likelihood, "Vineyard likelihood", "1"),
-    }
+    kinds = dict(zip(RASTERS, (*surfaces, field.direction, field.spacing, field.likelihood), strict=True))
+    writers: list[Callable[[], None]] = [
+        partial(write_geopackage, layers, paths.geopackage(folder, parcel), date=date),
+        partial(_write_rasters, folder, parcel, kinds),
+        partial(_write_meshes, folder, parcel, meshes, points, plain=plain, geoid=geoid),
+        partial(_write_project, folder, parcel, layers, kinds, date=date, vertical=points.vertical),
+    ]
+    in_threads(lambda write: write(), writers)
 
-    def write_rasters() -> None:
-        for kind, (raster, description, unit) in rasters.items():
-            how = {"description": description, "unit": unit, "resampling": "nearest" if unit == "degree" else "average"}
-            path = paths.raster(folder, parcel, kind)
-            write_cog(raster, path, **how)
-            paths.raster_style(path).write_text(raster_style(kind, raster.values).qml(), encoding="utf-8")
 
-    canopy, origin = paths.canopy_mesh(folder, parcel), np.round(np.mean(points.extent, axis=0))
+def _write_rasters(folder: Path, parcel: str, rasters: dict[str, Raster]) -> None:
+    for kind, raster in rasters.items():
+        description, unit = RASTERS[kind]
+        path, resampling = paths.raster(folder, parcel, kind), "nearest" if unit == "degree" else "average"
+        write_cog(raster, path, description=description, unit=unit, resampling=resampling)
+        paths.raster_style(path).write_text(raster_style(kind, raster.values).qml(), encoding="utf-8")
+
+
+def _write_meshes(
+    folder: Path, parcel: str, meshes: list[Mesh], points: Cloud, *, plain: bool, geoid: float | None
+) -> None:
+    path, origin = paths.canopy_mesh(folder, parcel), np.round(np.mean(points.extent, axis=0))
+    extras = {"vertical": points.vertical}
+    write_glb(meshes, path, origin=origin, crs=points.crs.to_string(), extras=extras, plain=plain)
     where: dict[str, Any] = {"origin": origin, "crs": points.crs, "vertical": points.vertical, "geoid": geoid}
-    if tileset := parcel_tileset(meshes, canopy.name, **where):
+    if tileset := parcel_tileset(meshes, path.name, **where):
         paths.tileset(folder).write_text(json.dumps(tileset, indent=1), encoding="utf-8")
 
-    def write_meshes() -> None:
-        extras = {"vertical": points.vertical}
-        write_glb(meshes, canopy, origin=origin, crs=points.crs.to_string(), extras=extras, plain=plain)
 
-    def write_layers() -> None:
-        write_geopackage(layers, paths.geopackage(folder, parcel), date=date)
-
-    def write_project() -> None:
-        here = Path()
-        document = qgis_project(
-            parcel,
-            {name: conform(layer, name) for name, layer in layers.items()},
-            {kind: raster for kind, (raster, _, _) in rasters.items()},
-            geopackage=f"./{paths.geopackage(here, parcel)}",
-            tif={kind: f"./{paths.raster(here, parcel, kind)}" for kind in rasters},
-            notes=[f"Survey of {date:%Y-%m-%d}", *([points.vertical] if points.vertical else [])],
-        )
-        paths.project(folder, parcel).write_bytes(document)
-
-    in_threads(lambda write: write(), [write_layers, write_rasters, write_meshes, write_project])
+def _write_project(
+    folder: Path,
+    parcel: str,
+    layers: dict[str, gpd.GeoDataFrame],
+    rasters: dict[str, Raster],
+    *,
+    date: datetime,
+    vertical: str | None,
+) -> None:
+    here = Path()
+    document = qgis_project(
+        parcel,
+        {name: conform(layer, name) for name, layer in layers.items()},
+        rasters,
+        geopackage=f"./{paths.geopackage(here, parcel)}",
+        tif={kind: f"./{paths.raster(here, parcel, kind)}" for kind in rasters},
+        notes=[f"Survey of {date:%Y-%m-%d}", *([vertical] if vertical else [])],
+    )
+    paths.project(folder, parcel).write_bytes(document)
