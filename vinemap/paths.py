@@ -103,6 +103,36 @@ def classified_cloud(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_classified.laz"
 
 
+def exports() -> Path:
+    """Folder of what is exported from products, apart from them."""
+    return Path("exports")
+
+
+def export_folder(folder: Path, parcel: str, kind: str) -> Path:
+    """Folder of a parcel in one of the formats of exports."""
+    return folder / parcel / kind
+
+
+def exported(folder: Path, name: str, layer: str, suffix: str) -> Path:
+    """File of an export."""
+    return folder / f"{name}_{layer}{suffix}"
+
+
+def task_data(folder: Path) -> Path:
+    """Folder of ISO 11783-10, in which terminals look for TASKDATA.XML."""
+    return folder / "TASKDATA"
+
+
+def agopengps_field(folder: Path, parcel: str) -> Path:
+    """Folder of a field of AgOpenGPS, by whose name it is chosen there."""
+    return folder / parcel
+
+
+def agopengps_file(folder: Path, kind: str) -> Path:
+    """File of a field of AgOpenGPS."""
+    return folder / f"{kind}.txt"
+
+
 def tiles(folder: Path) -> Path:
     """Folder for the tiles of a cloud too large for memory, gone when the product is whole."""
     return folder / "tiles"

@@ -1,0 +1,115 @@
+"""What every format is written from: the layers of a product, and the lanes between its rows."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyogrio
+import shapely
+from pyogrio.errors import DataLayerError, DataSourceError
+
+from vinemap import paths
+from vinemap.crs import WGS84, Origin, to_main
+from vinemap.errors import InputError
+from vinemap.lanes import lanes_between
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+class Field(NamedTuple):
+    """A parcel as a machine wants it."""
+
+    parcel: str
+    survey: str
+    """Name of the survey; the parcel's where it was mapped alone."""
+    flown: str
+    """Date of the survey, as 2026-05-31."""
+    key: str
+    """That of the product's recipe."""
+    origin: Origin
+    rows: gpd.GeoDataFrame
+    lanes: gpd.GeoDataFrame
+    """Of :func:`vinemap.lanes.lanes_between`; empty if they weren't asked for."""
+    row_ends: gpd.GeoDataFrame
+    gaps: gpd.GeoDataFrame
+    outline: gpd.GeoDataFrame
+    """Layer ``parcel`` of the product."""
+
+    def wgs84(self, layer: str) -> gpd.GeoDataFrame:
+        """One of the layers in longitude and latitude, to a tenth of a millimetre; heights stay, to a millimetre."""
+        frame: gpd.GeoDataFrame = getattr(self, layer).to_crs(WGS84)
+        shapes, high = frame.geometry.to_numpy(), bool(frame.has_z.all())
+        shapes = shapely.transform(shapes, lambda xyz: np.c_[xyz[:, :2].round(9), xyz[:, 2:].round(3)], include_z=high)
+        return frame.set_geometry(gpd.GeoSeries(shapes, index=frame.index, crs=WGS84))
+
+    def guidance(self, lines: str) -> gpd.GeoDataFrame:
+        """``label``, ``kind`` ("lane", "row"), ``width_m`` (of the lane, or the rows' spacing) of chosen lines."""
+        kinds = {
+            "lane": self.lanes[["label", "width_m", "geometry"]],
+            "row": self.rows[["label", "spacing_m", "geometry"]].rename(columns={"spacing_m": "width_m"}),
+        }
+        chosen = [part.assign(kind=kind) for kind, part in kinds.items() if lines in (f"{kind}s", "both") and len(part)]
+        table: gpd.GeoDataFrame = pd.concat(chosen, ignore_index=True)
+        return table
+
+    def plane(self, frame: gpd.GeoDataFrame, *, grid: bool) -> gpd.GeoDataFrame:
+        """A layer in plan, in metres to the millimetre: in {Main}, or as it is in the grid of the product's CRS."""
+        shapes = shapely.force_3d(frame.geometry.to_numpy(), z=self.origin.alt)
+        if not grid:
+            shapes = shapely.transform(shapes, lambda xyz: to_main(xyz, frame.crs, self.origin), include_z=True)
+        shapes = shapely.transform(shapely.force_2d(shapes), lambda xy: xy.round(3))
+        return frame.set_geometry(gpd.GeoSeries(shapes, index=frame.index))
+
+    def blocks(self) -> Iterator[tuple[str, Field]]:
+        """Each block of rows with a name, for formats that know of one block only."""
+        numbers = sorted(self.rows["block"].unique())
+        for block in numbers:
+            name = self.parcel if len(numbers) == 1 else f"{self.parcel}_{block}"
+            rows, lanes = (layer[layer["block"] == block] for layer in (self.rows, self.lanes))
+            yield name, self._replace(rows=rows, lanes=lanes)
+
+
+def read_field(product: Path, *, lines: str, headland: float, outer: bool) -> Field:
+    """Read a product, given by its folder or its GeoPackage, and draw its lanes if they are wanted.
+
+    Raises
+    ------
+    InputError
+        If it is no whole product, or has no row, or no lane where one is wanted.
+    """
+    folder = product if product.is_dir() else product.parent
+    try:
+        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        parcel, origin = str(record["parcel"]), Origin(**record["origin"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{paths.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, or its GeoPackage"
+        ) from error
+    path = paths.geopackage(folder, parcel)
+    if product not in (folder, path):
+        raise InputError(f"{paths.shown(product)}: no product of vinemap: {paths.shown(path)} is one")
+    try:
+        layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("rows", "row_ends", "gaps", "parcel")}
+    except (DataSourceError, DataLayerError) as error:
+        raise InputError(f"{paths.shown(path)}: can't be read ({error}): map the parcel again") from error
+    rows = layers["rows"].sort_values("row_id", ignore_index=True)
+    if len(rows) == 0:
+        raise InputError(f"{paths.shown(path)}: has no row to export")
+    lanes = lanes_between(rows if lines != "rows" else rows[:0], headland=headland, outer=outer)
+    if lines != "rows" and len(lanes) == 0:
+        raise InputError(
+            f"{paths.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"
+        )
+    known = {
+        "survey": str(record.get("survey") or parcel),
+        "flown": str(record.get("flown") or "2000-01-01")[:10],
+        "key": str(record.get("key")),
+    }
+    rest = {"row_ends": layers["row_ends"], "gaps": layers["gaps"], "outline": layers["parcel"]}
+    return Field(parcel=parcel, origin=origin, rows=rows, lanes=lanes, **known, **rest)

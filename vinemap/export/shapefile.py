@@ -1,0 +1,44 @@
+"""Shapefiles, for terminals that read nothing else (ESRI Shapefile Technical Description, 1998)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pyogrio
+
+from vinemap import paths
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vinemap.export.field import Field
+
+# Names of columns have ten characters at the most.
+COLUMNS = {
+    "rows": ("row_id", "label", "block", "length_m", "spacing_m", "height_m", "width_m", "gap_m"),
+    "lanes": ("lane_id", "label", "block", "right_rows", "left_rows", "length_m", "width_m", "narrowest_m", "clear_m"),
+    "outline": ("parcel", "n_rows", "area_m2", "spacing_m"),
+}
+SHORT = {"narrowest_m": "narrow_m"}
+GEOMETRY = {"rows": "LineString Z", "lanes": "LineString Z", "outline": "MultiPolygon"}
+
+
+def write_shapefile(field: Field, folder: Path) -> None:
+    """Write ``rows``, ``lanes`` and ``parcel``, as far as they aren't empty, in WGS 84 and with names in UTF-8.
+
+    Raises
+    ------
+    OSError or pyogrio.errors.DataSourceError
+        If one can't be written.
+    """
+    for layer, columns in COLUMNS.items():
+        frame = field.wgs84(layer)[[*columns, "geometry"]].rename(columns=SHORT)
+        if len(frame):
+            pyogrio.write_dataframe(
+                frame,
+                paths.exported(folder, field.parcel, "parcel" if layer == "outline" else layer, ".shp"),
+                driver="ESRI Shapefile",
+                geometry_type=GEOMETRY[layer],
+                encoding="UTF-8",
+                layer_options={"DBF_DATE_LAST_UPDATE": field.flown},
+            )

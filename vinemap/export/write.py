@@ -1,0 +1,111 @@
+"""Products in the formats that were asked for, each in a folder of its own."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
+
+from vinemap import __version__, paths, store
+from vinemap.errors import InputError
+from vinemap.export.agopengps import write_agopengps
+from vinemap.export.field import read_field
+from vinemap.export.geojson import write_geojson
+from vinemap.export.isoxml import write_isoxml
+from vinemap.export.nav2 import write_nav2
+from vinemap.export.opennav_coverage import write_opennav_coverage
+from vinemap.export.shapefile import write_shapefile
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from vinemap.export.field import Field
+
+
+def export_products(
+    products: Sequence[Path],
+    out: Path,
+    *,
+    formats: Sequence[str],
+    lines: str = "lanes",
+    headland: float = 3.0,
+    outer: bool = False,
+    frame: str = "map",
+    grid: bool = False,
+    vertices: int | None = None,
+) -> Iterator[str]:
+    """Write products into ``out/<parcel>/<format>``, each whole or not at all, and say so in a line for each parcel.
+
+    An earlier export is replaced; other files in its folder stay.
+
+    Parameters
+    ----------
+    products : sequence of Path
+        Folders or GeoPackages of products; all are read before the first is written.
+    out : Path
+        Folder of the parcels' folders.
+    formats : sequence of str
+        Of :data:`vinemap.export.FORMATS`.
+    lines : str
+        What guidance is written of: "lanes", "rows" or "both".
+    headland, outer
+        As for :func:`vinemap.lanes.lanes_between`.
+    frame, grid, vertices
+        As for :func:`vinemap.export.opennav_coverage.write_opennav_coverage`.
+
+    Raises
+    ------
+    InputError
+        If one is no product, has nothing to export, or bears the name of another.
+    OutputError
+        If nothing can be written there.
+    """
+    fields = [read_field(product, lines=lines, headland=headland, outer=outer) for product in products]
+    names = [field.parcel for field in fields]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
+    robot: dict[str, Any] = {"frame": frame, "grid": grid}
+    writers: dict[str, tuple[Callable[..., None], dict[str, Any]]] = {
+        "agopengps": (write_agopengps, {"lines": lines}),
+        "geojson": (write_geojson, {}),
+        "isoxml": (write_isoxml, {"lines": lines}),
+        "nav2": (write_nav2, robot),
+        "opennav_coverage": (write_opennav_coverage, robot | {"vertices": vertices}),
+        "shapefile": (write_shapefile, {}),
+    }
+    drawn = {"lines": lines, "headland": headland, "outer": outer}
+    for field in fields:
+        for kind in formats:
+            write, options = writers[kind]
+            target = paths.export_folder(out, field.parcel, kind)
+            _write_whole(target, partial(write, field, **options), _record(field, kind, drawn | options))
+        yield (
+            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(out / field.parcel)} "
+            f"({', '.join(formats)})"
+        )
+
+
+def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, Any]) -> None:
+    with store.product(target, within=target.parent) as draft:
+        try:
+            write(draft)
+        except (DataSourceError, DataLayerError, FeatureError) as error:
+            raise OSError(" ".join(str(error).split())) from error
+        record["files"] = sorted(path.name for path in draft.iterdir())
+        paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _record(field: Field, kind: str, options: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "vinemap": __version__,
+        "survey": field.survey,
+        "parcel": field.parcel,
+        "product": field.key,
+        "format": kind,
+        "options": options,
+        "origin": field.origin._asdict(),
+        "crs": field.rows.crs.to_string(),
+    }
