@@ -43,7 +43,7 @@ STAGES = {
 }
 STAGES |= {"sections", "canopy", "cgon", "section_table", "classification", "odometry"}
 BESIDE = {"evaluate", "synthetic", "scenes"}
-FORMATS = {"agopengps", "geojson", "isoxml", "nav2", "opennav_coverage", "shapefile"}
+GUIDANCE = {"agopengps", "geojson", "isoxml", "nav2", "opennav_coverage", "shapefile"}
 SETTINGS = {"settings", "config", "paths"}
 CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
 # What each module of vinemap, and any flow, may import of vinemap. Its version is everyone's.
@@ -73,15 +73,16 @@ MAY_IMPORT = {
     "geoid": {"crs"},
     "globe": {"crs", "geoid", "mesh"},
     "mesh_files": {"crs", "errors", "mesh"},
-    "mesh_export": {"crs", "errors", "mesh", "mesh_files", "paths", "store"},
-    "gazebo": {"crs", "errors", "mesh", "mesh_export", "mesh_files", "paths"},
     "product": CHAIN | {"project", "style", "globe"},
     "neighbours": {"row_frame"},
     "lanes": {"neighbours", "row_frame"},
     "export": set(),
     "export.field": BASE | {"paths", "lanes"},
-    **{f"export.{name}": {"errors", "paths", "lanes", "export.field"} for name in FORMATS},
-    "export.write": {"errors", "paths", "store", "export.field", *(f"export.{name}" for name in FORMATS)},
+    **{f"export.{name}": {"errors", "paths", "lanes", "export.field"} for name in GUIDANCE},
+    "export.meshes": {"crs", "mesh", "mesh_files", "paths", "export.field"},
+    "export.gazebo": {"crs", "errors", "mesh", "mesh_files", "paths", "export.field", "export.meshes"},
+    "export.write": {"errors", "paths", "store", "export"}
+    | {f"export.{name}" for name in (*GUIDANCE, "field", "meshes", "gazebo")},
     "stac": CHAIN | {"store"},
     "parcel": CHAIN | {"product", "recipe", "notices", "store", "stac"},
     "workers": BASE,

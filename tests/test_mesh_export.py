@@ -1,6 +1,7 @@
 """Canopies as PLY, OBJ and a Gazebo model: read by trimesh, they stand where the product's rows do."""
 
 import json
+import shutil
 import xml.etree.ElementTree as ET
 
 import geopandas as gpd
@@ -13,21 +14,29 @@ from test_mesh import ORIGIN, bumpy, rows
 
 from vinemap import paths
 from vinemap.crs import Origin, main_to_wgs84, to_main
-from vinemap.errors import InputError, OutputError
-from vinemap.gazebo import export_gazebo
+from vinemap.errors import InputError
+from vinemap.export.write import export_products
 from vinemap.mesh import volume, write_glb
-from vinemap.mesh_export import export_obj, export_ply
 from vinemap.mesh_files import read_glb
 from vinemap.parcel import map_parcel
-from vinemap.synthetic import write_survey
-
-EXPORTS = [export_ply, export_obj, export_gazebo]
+from vinemap.scenes import hillside, rows_of
+from vinemap.synthetic import Vineyard, simulate, write_survey
 
 
 @pytest.fixture(scope="module")
 def product(vineyard, tmp_path_factory):
     cloud = write_survey(vineyard, tmp_path_factory.mktemp("survey"))
     return map_parcel(cloud, tmp_path_factory.mktemp("products") / "A", parcel="A").folder
+
+
+def export(product, folder, kind, **options):
+    """Where one format of a product lies, and its files but the record."""
+    list(export_products([product], folder, formats=[kind], **options))
+    place = folder / "A" / kind
+    files = [path for path in sorted(place.rglob("*")) if path.is_file() and path.name != "run.json"]
+    listed = {path.relative_to(place).as_posix() for path in files}
+    assert set(json.loads((place / "run.json").read_text())["files"]) == listed
+    return place, files
 
 
 def origin_of(product):
@@ -63,7 +72,7 @@ def test_what_is_no_mesh_of_ours(tmp_path, content):
 
 
 def test_ply_stands_on_the_rows_in_main(product, tmp_path):
-    file, about = export_ply(product, tmp_path)
+    _, (file, about) = export(product, tmp_path, "ply")
     assert (file.name, about.name) == ("A_canopy.ply", "A_canopy_frame.json")
     mesh = trimesh.load_mesh(file, process=False)
     row_id = mesh.metadata["_ply_raw"]["vertex"]["data"]["row_id"].ravel()
@@ -88,7 +97,7 @@ def test_ply_stands_on_the_rows_in_main(product, tmp_path):
 
 
 def test_ply_in_the_crs_is_off_by_what_it_says(product, tmp_path):
-    file, about = export_ply(product, tmp_path, frame="crs")
+    _, (file, about) = export(product, tmp_path, "ply", grid=True)
     offset = json.loads(about.read_text())["offset"]
     found = np.asarray(trimesh.load_mesh(file, process=False).vertices) + offset
     truth = np.concatenate([mesh.vertices for mesh in read_glb(paths.canopy_mesh(product, "A")).meshes])
@@ -97,7 +106,7 @@ def test_ply_in_the_crs_is_off_by_what_it_says(product, tmp_path):
 
 
 def test_obj_has_a_named_object_a_row(product, tmp_path):
-    file, about = export_obj(product, tmp_path)
+    _, (file, about) = export(product, tmp_path, "obj")
     scene = trimesh.load_scene(file, split_objects=True, process=False)
     meshes = read_glb(paths.canopy_mesh(product, "A")).meshes
     assert set(scene.geometry) == {mesh.label for mesh in meshes}
@@ -111,8 +120,8 @@ def test_obj_has_a_named_object_a_row(product, tmp_path):
 
 
 def test_a_gazebo_world_is_the_vineyard(product, tmp_path):
-    files = export_gazebo(product, tmp_path)
-    assert {path.relative_to(tmp_path).as_posix() for path in files} == {
+    place, files = export(product, tmp_path, "gazebo")
+    assert {path.relative_to(place).as_posix() for path in files} == {
         "A_vineyard.sdf",
         "A_vineyard/model.config",
         "A_vineyard/model.sdf",
@@ -120,40 +129,39 @@ def test_a_gazebo_world_is_the_vineyard(product, tmp_path):
         "A_vineyard/meshes/terrain.obj",
         "A_vineyard/meshes/vineyard.mtl",
     }
-    world, model = (ET.parse(tmp_path / name).getroot() for name in ("A_vineyard.sdf", "A_vineyard/model.sdf"))
+    world, model = (ET.parse(place / name).getroot() for name in ("A_vineyard.sdf", "A_vineyard/model.sdf"))
     about = world.find("world/spherical_coordinates")
     found = [float(about.find(name).text) for name in ("latitude_deg", "longitude_deg", "elevation")]
     assert found == list(origin_of(product))
-    config = ET.parse(tmp_path / "A_vineyard/model.config").getroot()
+    config = ET.parse(place / "A_vineyard/model.config").getroot()
     assert config.find("sdf").text == "model.sdf"
     assert world.find("world/include/uri").text == "model://A_vineyard"
-    for place in model.iter("uri"):
-        assert (tmp_path / place.text.removeprefix("model://")).is_file()
-    ground = trimesh.load_mesh(tmp_path / "A_vineyard/meshes/terrain.obj")
+    for part in model.iter("uri"):
+        assert (place / part.text.removeprefix("model://")).is_file()
+    ground = trimesh.load_mesh(place / "A_vineyard/meshes/terrain.obj")
     assert ground.face_normals[:, 2].min() > 0.5
     lat, lon, alt = main_to_wgs84(ground.vertices, origin_of(product)).T
     with rasterio.open(paths.raster(product, "A", "dtm")) as dtm:
         nodes = Transformer.from_crs(4326, dtm.crs, always_xy=True).transform(lon, lat)
         heights = np.array([value[0] for value in dtm.sample(np.column_stack(nodes))])
     assert np.quantile(np.abs(heights - alt), 0.95) < 0.1
-    canopy = trimesh.load_mesh(tmp_path / "A_vineyard/meshes/canopy.obj")
+    canopy = trimesh.load_mesh(place / "A_vineyard/meshes/canopy.obj")
     assert (canopy.bounds[0, :2] > ground.bounds[0, :2]).all()
     assert (canopy.bounds[1, :2] < ground.bounds[1, :2]).all()
 
 
-@pytest.mark.parametrize("export", EXPORTS)
-def test_the_same_again_is_the_same(product, tmp_path, export):
-    first = {path: path.read_bytes() for path in export(product, tmp_path / "out")}
-    assert {path: path.read_bytes() for path in export(product, tmp_path / "out")} == first
-    assert {path for path in (tmp_path / "out").rglob("*") if path.is_file()} == set(first)
+def test_a_parcel_of_a_single_row_has_meshes_without_lanes(tmp_path):
+    plots = [Vineyard("A", rows_of(1, length=20))]
+    cloud = write_survey(simulate(plots, hillside(0.1), name="one", density=200, seed=1), tmp_path)
+    product = map_parcel(cloud, tmp_path / "product", parcel="A").folder
+    _, (file, _) = export(product, tmp_path, "ply")
+    assert trimesh.load_mesh(file).is_watertight
 
 
-@pytest.mark.parametrize("export", EXPORTS)
-def test_faults_leave_nothing(product, tmp_path, export):
-    with pytest.raises(InputError, match="holds no product"):
-        export(tmp_path, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="choose another folder"):
-        export(product, tmp_path / "file")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+def test_a_product_whose_meshes_are_gone_leaves_nothing(product, tmp_path):
+    broken = shutil.copytree(product, tmp_path / "broken")
+    paths.canopy_mesh(broken, "A").unlink()
+    for kind in ("ply", "obj", "gazebo"):
+        with pytest.raises(InputError, match=r"A_canopy\.glb"):
+            list(export_products([broken], tmp_path / "out", formats=[kind]))
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file() and not path.name.endswith(".lock")]

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 class Field(NamedTuple):
     """A parcel as a machine wants it."""
 
+    folder: Path
+    """The product's."""
     parcel: str
     survey: str
     """Name of the survey; the parcel's where it was mapped alone."""
@@ -112,4 +114,4 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool) -> Fi
         "key": str(record.get("key")),
     }
     rest = {"row_ends": layers["row_ends"], "gaps": layers["gaps"], "outline": layers["parcel"]}
-    return Field(parcel=parcel, origin=origin, rows=rows, lanes=lanes, **known, **rest)
+    return Field(folder=folder, parcel=parcel, origin=origin, rows=rows, lanes=lanes, **known, **rest)

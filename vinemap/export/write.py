@@ -10,10 +10,13 @@ from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap import __version__, paths, store
 from vinemap.errors import InputError
+from vinemap.export import MESHES
 from vinemap.export.agopengps import write_agopengps
 from vinemap.export.field import read_field
+from vinemap.export.gazebo import write_gazebo
 from vinemap.export.geojson import write_geojson
 from vinemap.export.isoxml import write_isoxml
+from vinemap.export.meshes import write_canopy
 from vinemap.export.nav2 import write_nav2
 from vinemap.export.opennav_coverage import write_opennav_coverage
 from vinemap.export.shapefile import write_shapefile
@@ -63,17 +66,21 @@ def export_products(
     OutputError
         If nothing can be written there.
     """
-    fields = [read_field(product, lines=lines, headland=headland, outer=outer) for product in products]
+    wanted = lines if set(formats) - set(MESHES) else "rows"
+    fields = [read_field(product, lines=wanted, headland=headland, outer=outer) for product in products]
     names = [field.parcel for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
     robot: dict[str, Any] = {"frame": frame, "grid": grid}
     writers: dict[str, tuple[Callable[..., None], dict[str, Any]]] = {
         "agopengps": (write_agopengps, {"lines": lines}),
+        "gazebo": (write_gazebo, {}),
         "geojson": (write_geojson, {}),
         "isoxml": (write_isoxml, {"lines": lines}),
         "nav2": (write_nav2, robot),
+        "obj": (write_canopy, {"kind": "obj", "grid": grid}),
         "opennav_coverage": (write_opennav_coverage, robot | {"vertices": vertices}),
+        "ply": (write_canopy, {"kind": "ply", "grid": grid}),
         "shapefile": (write_shapefile, {}),
     }
     drawn = {"lines": lines, "headland": headland, "outer": outer}
@@ -94,7 +101,7 @@ def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, 
             write(draft)
         except (DataSourceError, DataLayerError, FeatureError) as error:
             raise OSError(" ".join(str(error).split())) from error
-        record["files"] = sorted(path.name for path in draft.iterdir())
+        record["files"] = sorted(path.relative_to(draft).as_posix() for path in draft.rglob("*") if path.is_file())
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -10,14 +10,17 @@ import numpy as np
 from pyproj import CRS
 
 from vinemap import paths
-from vinemap.crs import Origin, to_main
+from vinemap.crs import to_main
 from vinemap.errors import InputError
+from vinemap.export.meshes import place_canopies
 from vinemap.mesh import Mesh
-from vinemap.mesh_export import comments, place_canopies, write_files
 from vinemap.mesh_files import write_obj
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from vinemap.crs import Origin
+    from vinemap.export.field import Field
 
 TERRAIN_CELL = 1.0
 """Metres, about, between the vertices of the terrain."""
@@ -70,38 +73,42 @@ WORLD = """<?xml version="1.0"?>
 """
 
 
-def export_gazebo(product: Path, folder: Path) -> list[Path]:
+def write_gazebo(field: Field, folder: Path) -> None:
     """Write a product as a static model for Gazebo, terrain and canopies as OBJ, and a world that holds it.
 
     The world's frame is {Main}, and its spherical coordinates are {Main}'s origin, so that a robot's GNSS is right.
-    Parameters and errors are those of :func:`export_ply`.
+
+    Raises
+    ------
+    InputError
+        If the product's meshes or terrain can't be read.
+    OSError
+        If nothing can be written.
 
     References
     ----------
     http://sdformat.org/spec?ver=1.9
     """
-    canopy = place_canopies(product, "main")
-    origin = Origin(**canopy.about["origin"])
-    ground = terrain_mesh(paths.raster(product, canopy.parcel, "dtm"), origin)
-    name = re.sub(r"\W+", "_", f"{canopy.parcel}_vineyard", flags=re.ASCII)
+    canopy = place_canopies(field)
+    ground = terrain_mesh(paths.raster(field.folder, field.parcel, "dtm"), field.origin)
+    name = re.sub(r"\W+", "_", f"{field.parcel}_vineyard", flags=re.ASCII)
+    model = folder / name
+    (model / "meshes").mkdir(parents=True)
+    (model / "meshes" / "vineyard.mtl").write_text(MATERIALS, encoding="utf-8")
+    parts = {kind: meshes for kind, meshes in {"canopy": canopy.meshes, "terrain": [ground]}.items() if _faces(meshes)}
+    for kind, meshes in parts.items():
+        how: dict[str, Any] = {"comments": canopy.comments(), "material": ("vineyard.mtl", kind)}
+        write_obj(meshes, model / "meshes" / f"{kind}.obj", **how)
+    links = "".join(LINK.format(part=part, model=name) for part in parts)
+    title = escape(f"Vineyard {field.parcel}")
+    (model / "model.config").write_text(CONFIG.format(title=title), encoding="utf-8")
+    (model / "model.sdf").write_text(MODEL.format(model=name, links=links), encoding="utf-8")
+    world = WORLD.format(model=name, **field.origin._asdict())
+    (folder / f"{name}.sdf").write_text(world, encoding="utf-8")
 
-    def write(draft: Path) -> None:
-        model = draft / name
-        (model / "meshes").mkdir(parents=True)
-        (model / "meshes" / "vineyard.mtl").write_text(MATERIALS, encoding="utf-8")
-        for kind, meshes in {"canopy": canopy.meshes, "terrain": [ground]}.items():
-            if any(len(mesh.faces) for mesh in meshes):
-                how: dict[str, Any] = {"comments": comments(canopy), "material": ("vineyard.mtl", kind)}
-                write_obj(meshes, model / "meshes" / f"{kind}.obj", **how)
-        parts = [path.stem for path in sorted((model / "meshes").glob("*.obj"))]
-        title = escape(f"Vineyard {canopy.parcel}")
-        links = "".join(LINK.format(part=part, model=name) for part in parts)
-        (model / "model.config").write_text(CONFIG.format(title=title), encoding="utf-8")
-        (model / "model.sdf").write_text(MODEL.format(model=name, links=links), encoding="utf-8")
-        world = WORLD.format(model=name, **origin._asdict())
-        (draft / f"{name}.sdf").write_text(world, encoding="utf-8")
 
-    return write_files(folder, write)
+def _faces(meshes: list[Mesh]) -> bool:
+    return any(len(mesh.faces) for mesh in meshes)
 
 
 def terrain_mesh(dtm: Path, origin: Origin, *, cell: float = TERRAIN_CELL) -> Mesh:
