@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
+from vinemap.index import write_index
 from vinemap.parcel import call, follow
 from vinemap.pieces import split_cloud
 from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
@@ -57,7 +58,7 @@ def map_survey(
 
     The cloud is read once and every point goes to the parcels that hold it. Each parcel is then worked by a process of
     its own: what goes wrong there, a crash or too long a time even, is that parcel's alone. ``survey.json`` in the
-    folder tells at the end what became of each.
+    folder tells at the end what became of each, and ``index.html`` shows it.
 
     Parameters
     ----------
@@ -98,6 +99,7 @@ def map_survey(
                 write_record(folder, config.survey, plan, outcomes, began)
                 given = [(source.path, source.record()) for source in plan.sources]
                 write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
+                write_index(folder, config.survey)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:
