@@ -66,7 +66,7 @@ def test_missing_vines_are_gaps(product, vineyard):
 def test_product_is_the_contracts(product):
     folder = product.folder
     record = json.loads((folder / "run.json").read_text())
-    expected = {"A.gpkg", "A_canopy.glb", "A_stac.json", *(f"A_{kind}.tif" for kind in RASTERS)}
+    expected = {"A.gpkg", "A_canopy.glb", "A_report.html", "A_stac.json", *(f"A_{kind}.tif" for kind in RASTERS)}
     assert {p.name for p in folder.iterdir()} == expected | {"run.json"}
     assert set(record["files"]) == expected
     assert record["origin"] == {"lat": 44.6, "lon": 7.9, "alt": 250.0}

@@ -73,20 +73,26 @@ def compare_rows(
     j, i = match_rows(moved, before, overlap=overlap, width=near).T
     order = np.argsort(j)
     j, i = j[order], i[order]
-    same = pd.DataFrame({"state": SAME, "label": later["label"].to_numpy()[j], "earlier": earlier["label"].to_numpy()[i]})
+    same = pd.DataFrame(
+        {"state": SAME, "label": later["label"].to_numpy()[j], "earlier": earlier["label"].to_numpy()[i]}
+    )
     for name in MEASURES:
         same[f"d_{name}"] = later[name].to_numpy(dtype=float)[j] - earlier[name].to_numpy(dtype=float)[i]
     new, gone = np.setdiff1d(np.arange(len(lines)), j), np.setdiff1d(np.arange(len(before)), i)
-    added = pd.DataFrame({
-        "state": NEW,
-        "label": later["label"].to_numpy()[new],
-        "part_of": _part_of(moved[new], before, earlier["label"].to_numpy(), near),
-    })
-    lost = pd.DataFrame({
-        "state": GONE,
-        "earlier": earlier["label"].to_numpy()[gone],
-        "part_of": _part_of(before[gone], moved, later["label"].to_numpy(), near),
-    })
+    added = pd.DataFrame(
+        {
+            "state": NEW,
+            "label": later["label"].to_numpy()[new],
+            "part_of": _part_of(moved[new], before, earlier["label"].to_numpy(), near),
+        }
+    )
+    lost = pd.DataFrame(
+        {
+            "state": GONE,
+            "earlier": earlier["label"].to_numpy()[gone],
+            "part_of": _part_of(before[gone], moved, later["label"].to_numpy(), near),
+        }
+    )
     same.index, added.index = pd.Index(j), pd.Index(new)
     present = pd.concat([part for part in (same, added) if len(part)] or [same]).sort_index()
     columns = ["state", "label", "earlier", "part_of", *(f"d_{name}" for name in MEASURES)]
@@ -152,7 +158,7 @@ def _move(lines: Lines, by: NDArray[np.float64]) -> Lines:
 
 def _across(lines: Lines, others: Lines, *, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Unit vectors (n, 2) across the nearest of other lines, and how far (n,) points of lines lie off it that way."""
-    points = shapely.points(shapely.get_coordinates(shapely.segmentize(lines, STEP)))
+    points = np.asarray(shapely.points(shapely.get_coordinates(shapely.segmentize(lines, STEP))))
     nearest = others[shapely.STRtree(others).nearest(points)]
     position = shapely.line_locate_point(nearest, points)
     inside = (position > 0) & (position < shapely.length(nearest)) & (shapely.distance(nearest, points) < reach)
@@ -187,18 +193,18 @@ def _solve(
     directions: NDArray[np.float64], offsets: NDArray[np.float64], weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
     """The shift (2,) whose parts in some directions (n, 2) are the offsets (n,), whatever some of them say."""
-    shift = np.zeros(2)
+    shift: NDArray[np.float64] = np.zeros(2)
     if len(offsets) == 0:
         return shift
     given = np.ones(len(offsets)) if weights is None else weights
     trust = np.ones(len(offsets))
     for _ in range(TURNS):
         scaled = given * np.sqrt(trust)
-        shift = np.linalg.lstsq(directions * scaled[:, None], offsets * scaled, rcond=WEAK)[0]
+        shift = np.asarray(np.linalg.lstsq(directions * scaled[:, None], offsets * scaled, rcond=WEAK)[0])
         residuals = offsets - directions @ shift
         scale = max(1.4826 * float(np.median(np.abs(residuals))), SHORTEST)
         trust = np.clip(1 - (residuals / (4.685 * scale)) ** 2, 0, None) ** 2
-    return np.asarray(shift)
+    return shift
 
 
 def _part_of(lines: Lines, others: Lines, labels: NDArray[np.object_], width: float) -> list[str | None]:
@@ -207,6 +213,8 @@ def _part_of(lines: Lines, others: Lines, labels: NDArray[np.object_], width: fl
         return [None] * len(lines)
     i, j = shapely.STRtree(others).query(shapely.buffer(lines, width), predicate="intersects")
     share = np.zeros((len(lines), len(others)))
-    share[i, j] = shapely.length(shapely.intersection(lines[i], shapely.buffer(others[j], width))) / shapely.length(lines[i])
+    share[i, j] = shapely.length(shapely.intersection(lines[i], shapely.buffer(others[j], width))) / shapely.length(
+        lines[i]
+    )
     best = share.argmax(axis=1)
     return [str(labels[k]) if share[row, k] >= 0.5 else None for row, k in enumerate(best)]

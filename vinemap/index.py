@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,15 +15,17 @@ import shapely
 from pyproj import CRS
 
 from vinemap import __version__, paths
-from vinemap.changes import MEASURES, compare_rows, summarise
+from vinemap.changes import GONE, MEASURES, compare_rows, summarise
 from vinemap.compiled import in_threads
 from vinemap.crs import WGS84, project
 from vinemap.page import as_json, page, page_hash, polylines, rings
 from vinemap.store import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
 """What is read of rows."""
@@ -75,8 +78,14 @@ def write_index(folder: Path, survey: str) -> bool:
     if not products and not known:
         return False
     earlier = find_earlier(products, folder)
-    made_of = [__version__, page_hash("index"), survey, known, *(product.key for product in products.values())]
-    made_of += [[name, product.survey, product.key] for name, product in earlier.items()]
+    made_of: list[Any] = [
+        __version__,
+        page_hash("index"),
+        survey,
+        known,
+        *(product.key for product in products.values()),
+    ]
+    made_of += [[name, product.survey, product.parcel, product.key] for name, product in earlier.items()]
     key = hashlib.sha256(as_json(made_of).encode()).hexdigest()
     target = paths.index(folder)
     if _key_of(target) == key:
@@ -208,13 +217,15 @@ def survey_page(
         Stands in the page, to tell what it was made of.
     """
     crs = CRS.from_user_input(next(iter(products.values())).crs) if products else WGS84
-    tables = in_threads(lambda product: read_rows(product.folder, product.parcel), products.values())
-    rows = dict(zip(products, tables, strict=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on odd files
+        tables = in_threads(lambda product: read_rows(product.folder, product.parcel), products.values())
+        rows = dict(zip(products, tables, strict=True))
+        pairs = [(rows[name], product) for name, product in earlier.items()]
+        compared = dict(zip(earlier, in_threads(lambda pair: _compare(*pair), pairs), strict=True))
     shapes = {name: project(product.outline, WGS84, crs) for name, product in products.items()}
     bounds = shapely.total_bounds(list(shapes.values())) if shapes else np.zeros(4)
     zero = np.floor(bounds[:2])
-    pairs = [(name, rows[name], product) for name, product in earlier.items()]
-    compared = dict(zip(earlier, in_threads(lambda pair: _compare(*pair), pairs), strict=True))
     parcels = []
     for name in sorted({*known, *products}):
         one: dict[str, Any] = {"parcel": name, "state": "done", "reason": "", **known.get(name, {})}
@@ -222,12 +233,16 @@ def survey_page(
             one |= _described(products[name], rows[name], compared.get(name, {}))
             one["outline"] = rings(shapes[name], zero, tolerance=TOLERANCE, digits=1)
         parcels.append(one)
-    lines = {
-        name: polylines(table.to_crs(crs).geometry, zero, tolerance=TOLERANCE, digits=1)
-        for name, table in rows.items()
-        if table is not None
+
+    def drawn(lines: gpd.GeoSeries) -> list[list[list[float]]]:
+        return polylines(lines.to_crs(crs), zero, tolerance=TOLERANCE, digits=1)
+
+    details = {
+        "lines": {name: drawn(table.geometry) for name, table in rows.items() if table is not None},
+        "changes": {
+            name: one["rows"] | {"gone": drawn(one["gone"])} for name, one in compared.items() if "rows" in one
+        },
     }
-    details = {"lines": lines, "changes": {name: one["rows"] for name, one in compared.items() if "rows" in one}}
     flown = sorted(product.flown for product in products.values())
     data = {
         "vinemap": __version__,
@@ -254,9 +269,11 @@ def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
     return lines
 
 
-def _compare(name: str, rows: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
+def _compare(rows: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
     """What has changed in a parcel since a product, or why nothing can be said."""
-    told: dict[str, Any] = {"since": {"survey": before.survey, "parcel": before.parcel, "flown": before.flown.isoformat()}}
+    told: dict[str, Any] = {
+        "since": {"survey": before.survey, "parcel": before.parcel, "flown": before.flown.isoformat()}
+    }
     earlier = read_rows(before.folder, before.parcel)
     if rows is None or earlier is None:
         return told | {"remark": f"rows of {'this' if rows is None else 'the earlier'} survey can't be read"}
@@ -267,22 +284,29 @@ def _compare(name: str, rows: gpd.GeoDataFrame | None, before: Product) -> dict[
     table = changes.rows
     numbers = rows.set_index("label")
     lost = earlier.set_index("label")
-    columns: dict[str, Any] = {name: table[name].where(table[name].notna(), None).tolist() for name in table.columns[:4]}
+    columns: dict[str, Any] = {
+        name: [word if isinstance(word, str) else None for word in table[name]] for name in table.columns[:4]
+    }
     for name, digits in DIGITS.items():
         now, then = (
             labels.map(source[name].to_dict()).to_numpy(dtype=float)
             for labels, source in ((table["label"], numbers), (table["earlier"], lost))
         )
-        columns[name] = _round(np.where(table["state"] == "gone", then, now), digits)
+        columns[name] = _round(np.where(table["state"] == GONE, then, now), digits)
         columns[f"d_{name}"] = _round(table[f"d_{name}"].to_numpy(dtype=float), digits)
         if name == "volume_m3":
             columns["d_volume"] = _round(table["d_volume_m3"].to_numpy(dtype=float) / then, 4)
-    summary = summarise(changes, rows, earlier)
-    return told | {"shift": changes.shift, "summary": summary, "rows": columns}
+    gone = earlier[earlier["label"].isin(table.loc[table["state"] == GONE, "earlier"])].to_crs(rows.crs)
+    return told | {
+        "shift": changes.shift,
+        "summary": summarise(changes, rows, earlier),
+        "rows": columns,
+        "gone": gone.translate(*changes.shift),
+    }
 
 
-def _round(values: np.ndarray[Any, Any], digits: int) -> list[float]:
-    return np.round(values, digits).tolist()
+def _round(values: NDArray[np.float64], digits: int) -> list[float]:
+    return list(np.round(values, digits))
 
 
 def _described(product: Product, rows: gpd.GeoDataFrame | None, compared: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,15 @@ LEVEL = 6
 """Of compression."""
 
 
-def page(name: str, title: str, data: Mapping[str, Any], *, packed: Mapping[str, bytes], scripts: Sequence[str] = (), key: str = "") -> str:
+def page(
+    name: str,
+    title: str,
+    data: Mapping[str, Any],
+    *,
+    packed: Mapping[str, bytes],
+    scripts: Sequence[str] = (),
+    key: str = "",
+) -> str:
     """A page as one HTML file.
 
     Its policy forbids the browser to load anything, and to run any script but those that were bundled with it.
@@ -56,7 +64,9 @@ def page(name: str, title: str, data: Mapping[str, Any], *, packed: Mapping[str,
         f"default-src 'none'; script-src {' '.join(_hash(part) for part in parts)}; style-src {_hash(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    later = [f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:])]
+    later = [
+        f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:], strict=True)
+    ]
     blocks = [f'<script type="text/plain" id="{key}">{_pack(value)}</script>' for key, value in packed.items()]
     return Template(_part(f"{name}.html")).substitute(
         policy=policy,

@@ -312,8 +312,7 @@ def follow(
             | {name: version(name) for name in LIBRARIES}
             | (pdal_versions() if with_pdal else {}),
         }
-        canopies = paths.canopy_mesh(draft, parcel).read_bytes()
-        page = parcel_page(record, layers, seen.dtm, seen.chm, canopies)
+        page = parcel_page(record, layers, seen.dtm, seen.chm, paths.canopy_mesh(draft, parcel).read_bytes())
         paths.report(draft, parcel).write_text(page, encoding="utf-8")
         item = parcel_item(
             draft,
@@ -331,8 +330,10 @@ def follow(
             survey=recipe.survey,
         )
         save(item, paths.stac_item(draft, parcel))
-        record["seconds"] = seconds | {"All": round(time.perf_counter() - began, 3)}
-        record["files"] = {path.name: path.stat().st_size for path in sorted(draft.iterdir())}
+        record |= {
+            "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
+            "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
+        }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
     return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(record["warnings"]))
 

@@ -118,7 +118,7 @@ def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]
         "rows": len(rows),
         "length_m": float(length.sum()),
         "area_m2": float(parcel.area.sum()),
-        "spacing_m": float(rows["spacing_m"].mean()) if len(rows) else np.nan,
+        "spacing_m": float(rows["spacing_m"].mean()) if len(rows) > 1 else np.nan,
         "volume_m3": float(rows["volume_m3"].sum()),
         "n_missing": int(rows["n_missing"].sum()),
         "gap_m": float(rows["gap_m"].sum()),

@@ -7,9 +7,11 @@ import { table } from "./table.js";
 const { parcels, survey, flown, vinemap } = data;
 const mapped = parcels.filter((parcel) => parcel.outline);
 const selected = choice();
+const percent = (share) => (share === null ? null : 100 * share);
 const sum = (name) => mapped.reduce((total, parcel) => total + (parcel[name] ?? 0), 0);
 const href = (parcel, kind) => [parcel.folder, parcel.files[kind]].map(encodeURIComponent).join("/");
-const signed = (digits) => (value) => change(value, digits);
+const changed = (digits, options) => (value) => change(value, digits, options);
+const FELL = { good: -1, least: 0.5 }; // better where it is less
 
 head();
 start();
@@ -27,7 +29,7 @@ async function start() {
       else line.removeAttribute("aria-current");
     });
     at("parcel").value = String(mapped.indexOf(parcel));
-    map.select(parcel);
+    map.select(parcel, changes[parcel.parcel]);
     showChanges(parcel, changes[parcel.parcel]);
   });
   if (mapped.length) selected.set(mapped.find((parcel) => parcel.summary) ?? mapped[0]);
@@ -65,10 +67,10 @@ function head() {
   at("footer").textContent = `Made by vinemap ${vinemap}. This file asks no network for anything; its links lead to the parcels’ folders beside it.`;
 }
 
-function change(value, digits, { unit = "", good = 1 } = {}) {
-  const shown = number(value, digits, { signed: true });
-  const turn = value === null || value === undefined ? 0 : Math.sign(Number(value.toFixed(digits))) * good;
-  return element("span", { class: turn > 0 ? "up" : turn < 0 ? "down" : null }, shown + (value === null || value === undefined ? "" : unit));
+/** A change; in colour where it is one for the better or worse, and more than what can be measured. */
+function change(value, digits, { least = 0, good = 1 } = {}) {
+  const turn = Math.abs(value ?? 0) > least ? Math.sign(value) * good : 0;
+  return element("span", { class: turn > 0 ? "up" : turn < 0 ? "down" : null }, number(value, digits, { signed: true }));
 }
 
 function parcelTable() {
@@ -87,11 +89,11 @@ function parcelTable() {
     column("Missing", "vines", "n_missing", 0),
     column("Gaps", "m", "gap_m", 1),
     ...(compared ? [
-      { title: "Δ height", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_height_m"), show: signed(2) },
-      { title: "Δ width", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_width_m"), show: signed(2) },
-      { title: "Δ volume", unit: "%", help: "Since the survey before, of the rows that stand on both dates", values: since("d_volume").map((value) => value === null ? null : 100 * value), show: signed(1) },
-      { title: "Δ gaps", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_gap_m"), show: (value) => change(value, 1, { good: -1 }) },
-      { title: "Δ missing", unit: "vines", help: "Since the survey before, of the rows that stand on both dates", values: since("d_n_missing"), show: (value) => change(value, 0, { good: -1 }) },
+      { title: "Δ height", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_height_m"), show: changed(2, { least: 0.02 }) },
+      { title: "Δ width", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_width_m"), show: changed(2, { least: 0.03 }) },
+      { title: "Δ volume", unit: "%", help: "Since the survey before, of the rows that stand on both dates", values: since("d_volume").map(percent), show: changed(1, { least: 5 }) },
+      { title: "Δ gaps", unit: "m", help: "Since the survey before, of the rows that stand on both dates", values: since("d_gap_m"), show: changed(1, FELL) },
+      { title: "Δ missing", unit: "vines", help: "Since the survey before, of the rows that stand on both dates", values: since("d_n_missing"), show: changed(0, FELL) },
       { title: "New", unit: "rows", values: since("new"), show: (value) => number(value) },
       { title: "Gone", unit: "rows", values: since("gone"), show: (value) => number(value) },
     ] : []),
@@ -106,7 +108,7 @@ function parcelTable() {
 function links(parcel) {
   const words = { report: "report", layers: "GeoPackage", project: "QGIS" };
   const made = Object.entries(words).filter(([kind]) => parcel.files?.[kind]).map(([kind, word]) => element("a", { href: href(parcel, kind) }, word));
-  return element("span", {}, ...made.flatMap((link, k) => (k ? [" · ", link] : [link])));
+  return element("span", { class: "links" }, ...made.flatMap((link, k) => (k ? [" · ", link] : [link])));
 }
 
 function showChanges(parcel, rows) {
@@ -127,20 +129,20 @@ function showChanges(parcel, rows) {
   at("facts").textContent = `Since ${before}: ${plural(summary.same, "row")} ${summary.same === 1 ? "stands" : "stand"} as before, ${number(summary.new)} new, ${number(summary.gone)} gone. ${off}`;
   const what = (k) => ({ same: "", new: rows.part_of[k] ? `split from ${rows.part_of[k]}` : "new", gone: rows.part_of[k] ? `joined to ${rows.part_of[k]}` : "gone" }[rows.state[k]]);
   const column = (title, unit, name, digits) => ({ title, unit, values: rows[name], show: (value) => number(value, digits) });
-  const delta = (title, unit, name, digits, options) => ({ title, unit, values: rows[name], show: (value) => change(value, digits, options) });
+  const delta = (title, unit, name, digits, options) => ({ title, unit, values: rows[name], show: changed(digits, options) });
   const made = table([
     { title: "Row", text: true, values: rows.label.map((label, k) => label ?? `was ${rows.earlier[k]}`), show: (label, k) => rowLink(parcel, rows, k, label) },
     { title: "Was", text: true, values: rows.earlier, show: (label) => label ?? "" },
     { title: "Change", text: true, values: rows.state.map((_, k) => what(k) || null), show: (word) => word ?? "" },
-    column("Length", "m", "length_m", 1), delta("Δ", "m", "d_length_m", 1),
-    column("Height", "m", "height_m", 2), delta("Δ", "m", "d_height_m", 2),
-    column("Width", "m", "width_m", 2), delta("Δ", "m", "d_width_m", 2),
-    column("Volume", "m³", "volume_m3", 1), { title: "Δ", unit: "%", values: rows.d_volume.map((value) => (value === null ? null : 100 * value)), show: signed(1) },
-    column("Gaps", "m", "gap_m", 1), delta("Δ", "m", "d_gap_m", 1, { good: -1 }),
-    column("Missing", "vines", "n_missing", 0), delta("Δ", "", "d_n_missing", 0, { good: -1 }),
+    column("Length", "m", "length_m", 1), delta("Δ", "m", "d_length_m", 1, { least: Infinity }),
+    column("Height", "m", "height_m", 2), delta("Δ", "m", "d_height_m", 2, { least: 0.03 }),
+    column("Width", "m", "width_m", 2), delta("Δ", "m", "d_width_m", 2, { least: 0.04 }),
+    column("Volume", "m³", "volume_m3", 1), { title: "Δ", unit: "%", values: rows.d_volume.map(percent), show: changed(1, { least: 10 }) },
+    column("Gaps", "m", "gap_m", 1), delta("Δ", "m", "d_gap_m", 1, FELL),
+    column("Missing", "vines", "n_missing", 0), delta("Δ", "", "d_n_missing", 0, FELL),
   ], { caption: `Changes of the rows of ${parcel.parcel}` });
   made.lines.forEach((line, k) => line.classList.add(rows.state[k]));
-  at("rows").append(made.element, element("p", { class: "hint" }, "Rows are matched by where they stand, not by number. Of rows that are gone the earlier numbers stand here. Differences below 3 cm in height, 4 cm in width and 10% in a row’s volume are within what can be measured."));
+  at("rows").append(made.element, element("p", { class: "hint" }, "Rows are matched by where they stand, not by number. Of rows that are gone the earlier numbers stand here. Differences below 3 cm in height, 4 cm in width and 10% in a row’s volume are within what can be measured, and are not coloured."));
 }
 
 function rowLink(parcel, rows, k, label) {

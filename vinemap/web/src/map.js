@@ -38,13 +38,15 @@ export function showMap(rows, profiles, selected) {
   const { bounds: [west, south, east, north], png, tallest } = data.picture;
   new ImageOverlay(`data:image/png;base64,${png}`, [[south, west], [north, east]], { pane: "picture", className: "heights" }).addTo(map);
   const rings = data.outlines.flat();
-  const outline = new Polygon(rings.map((ring) => ring.map(place)), { fill: false, weight: 1.5, dashArray: "5 4", interactive: false }).addTo(map);
+  const under = new SVG({ pane: "halo", padding: 0.5 });
+  const outline = new Polygon(rings.map((ring) => ring.map(place)), {
+    renderer: under, fill: false, weight: 1.5, dashArray: "5 4", interactive: false,
+  }).addTo(map);
   const points = [...rings.flat(), ...rows.flatMap((row) => row.line.points)];
   keepInSight(map, points.length ? boundsOf(points) : [[south, west], [north, east]]);
 
   const canvas = new Canvas({ pane: "pieces", padding: 0.5 });
   const svg = new SVG({ pane: "hits", padding: 0.5 });
-  const under = new SVG({ pane: "halo", padding: 0.5 });
   const drawn = new LayerGroup().addTo(map);
   const gaps = rows.flatMap((row) => row.gaps.map((gap) => new Polyline(piece(row.line, gap.start, gap.end).map(place), {
     renderer: canvas, interactive: false, lineCap: "butt",

@@ -26,6 +26,8 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
     return { size: x1 - x0, mark: new Marker([(y0 + y1) / 2, (x0 + x1) / 2], { icon, interactive: false, keyboard: false, alt: "" }) };
   });
   const frame = new Polygon([], { renderer: canvas, fill: false, weight: 3, interactive: false });
+  const marks = new LayerGroup().addTo(map); // rows that are new or gone
+  let show = () => {};
   const options = Object.entries(QUANTITIES).filter(([, { of }]) => !of || parcels.some((parcel) => Number.isFinite(of(parcel))));
   const chosen = at("quantity");
   chosen.append(...options.map(([name, { title }]) => element("option", { value: name }, title)));
@@ -49,9 +51,12 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
     });
     frame.setStyle({ color: colour("selected") });
     if (frame.getLatLngs().flat(2).length) frame.remove().addTo(map);
+    show();
     legend(quantity, span);
   }
 
+  const marked = element("span", { id: "marks", class: "key", hidden: true },
+    element("span", { class: "dash fresh" }), "new row", element("span", { class: "dash lost" }), "row that is gone");
   function legend(quantity, [low, high]) {
     const bar = element("span", { class: "ramp", "aria-hidden": "true" });
     const colours = quantity.turned ? [...stops(quantity.diverging)].reverse() : stops(quantity.diverging);
@@ -60,7 +65,7 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
     at("legend").replaceChildren(...(quantity.of ? [
       element("span", {}, `${quantity.title}, ${quantity.unit}`),
       element("span", { class: "key" }, number(low, quantity.digits, signed), bar, number(high, quantity.digits, signed)),
-    ] : [element("span", {}, "Outlines of the parcels, and their rows")]));
+    ] : [element("span", {}, "Outlines of the parcels, and their rows")]), marked);
   }
 
   /** Names of parcels that are wide enough on the screen. */
@@ -80,7 +85,16 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
   label();
   let first = true;
   return {
-    select(parcel) {
+    select(parcel, changes) {
+      show = () => {
+        marks.clearLayers();
+        const added = (rows[parcel.parcel] ?? []).filter((_, k) => changes?.state[k] === "new");
+        const line = (points, options) => new Polyline(points.map(place), { renderer: canvas, interactive: false, weight: 3, ...options }).addTo(marks);
+        for (const points of added) line(points, { color: colour("selected") });
+        for (const points of changes?.gone ?? []) line(points, { color: colour("gap"), dashArray: "7 5" });
+        at("marks").hidden = !added.length && !changes?.gone.length;
+      };
+      show();
       frame.setLatLngs(parcel.outline.map((ring) => ring.map(place))).addTo(map);
       if (!first) map.fitBounds(boundsOf(parcel.outline.flat()), { padding: [40, 40], maxZoom: map.getBoundsZoom(all) + 3 });
       first = false;
