@@ -79,18 +79,21 @@ def column(browser, title, within="#table"):
     const table = document.querySelector(arguments[1] + " table");
     const heads = [...table.tHead.rows[0].cells];
     const k = heads.findIndex((head) => head.textContent.startsWith(arguments[0]));
-    return [heads[k].ariaSort ?? heads[k].getAttribute("aria-sort"), [...table.tBodies[0].rows].map((row) => row.cells[k].textContent)];
+    const cells = [...table.tBodies[0].rows].map((row) => row.cells[k].textContent);
+    return [heads[k].getAttribute("aria-sort"), cells];
     """
     return browser.execute_script(script, title, within)
 
 
+def bring(browser, one):
+    """Have something in the middle of the window, so that it can be clicked."""
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center', inline: 'center', behavior: 'instant'})", one)
+    return one
+
+
 def click_heading(browser, title, within="#table"):
     heads = browser.find_elements(By.CSS_SELECTOR, f"{within} thead button")
-    head = next(one for one in heads if one.get_attribute("textContent").startswith(title))
-    browser.execute_script(
-        "arguments[0].scrollIntoView({block: 'center', inline: 'center', behavior: 'instant'})", head
-    )
-    head.click()
+    bring(browser, next(one for one in heads if one.get_attribute("textContent").startswith(title))).click()
 
 
 def selected(browser):
@@ -120,7 +123,7 @@ def test_a_row_is_selected_everywhere(flights, open_page):
     browser = open_page(page_of(flights, "A"))
     assert selected(browser) == ["1 A"]
     hit = browser.find_element(By.CSS_SELECTOR, "path.hit[data-row='3']")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", hit)
+    bring(browser, hit)
     place = browser.execute_script(
         "const p = arguments[0], q = p.getPointAtLength(p.getTotalLength() / 3), m = p.getScreenCTM();"
         "return [q.x * m.a + m.e, q.y * m.d + m.f].map(Math.round)",
@@ -134,7 +137,7 @@ def test_a_row_is_selected_everywhere(flights, open_page):
         browser.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, **mouse, "button": "left", "clickCount": 1})
     until(lambda: selected(browser) == ["3 A"])
     assert "row 3 A" in browser.find_element(By.CSS_SELECTOR, ".plot").get_attribute("aria-label")
-    browser.find_element(By.ID, "after").click()
+    bring(browser, browser.find_element(By.ID, "after")).click()
     assert selected(browser) == ["4 A"]
     browser.execute_script("document.querySelectorAll('#table tbody th button')[0].click()")
     assert selected(browser) == ["1 A"]
@@ -190,7 +193,11 @@ def test_map_and_plots_are_drawn(flights, open_page):
 def test_a_phone_shows_the_page_in_its_width(flights, open_page, page):
     browser = open_page(flights / "september" / page, width=390, height=844)
     assert browser.execute_script("return document.documentElement.scrollWidth") == 390
-    script = "return [...document.querySelectorAll('h1, h2, select, button, .figures dd')].every((one) => one.closest('.scroll, [hidden], .along') || one.getBoundingClientRect().right <= 390)"
+    script = """
+    return [...document.querySelectorAll("h1, h2, select, button, .figures dd")].every(
+      (one) => one.closest(".scroll, [hidden], .along") || one.getBoundingClientRect().right <= 390,
+    );
+    """
     assert browser.execute_script(script)
 
 
@@ -217,7 +224,7 @@ def test_the_survey_shows_parcels_and_changes(flights, open_page):
     assert sorted(filter(None, column(browser, "Change", "#rows")[1])) == ["gone", "new"]
     links = {link.get_attribute("href") for link in browser.find_elements(By.CSS_SELECTOR, "#table a")}
     assert page_of(flights, "A").as_uri() in links
-    browser.find_element(By.CSS_SELECTOR, "#rows a").click()
+    bring(browser, browser.find_element(By.CSS_SELECTOR, "#rows a")).click()
     assert drawn(browser, "drawn")
     assert browser.find_element(By.ID, "title").text == "A"
 

@@ -151,9 +151,9 @@ def test_the_picture_tells_heights():
     values = np.array([[0.0, 1.5, 3.0, 9.0], [np.nan, 0.0, 0.0, 0.0]])
     png, across, down = canopy_picture(Raster(values, Grid(0.0, 0.0, 0.25, 2, 4), None))
     assert (across, down) == (1.0, 0.5)
-    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile(png) as file:
-        with pytest.warns(rasterio.errors.NotGeoreferencedWarning), file.open() as picture:
-            levels, inks = picture.read(1), picture.colormap(1)
+    unplaced = pytest.warns(rasterio.errors.NotGeoreferencedWarning)
+    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile(png) as file, unplaced, file.open() as picture:
+        levels, inks = picture.read(1), picture.colormap(1)
     assert levels.tolist()[0] == [1, 1 + round(0.5 * (SHADES - 1)), SHADES, SHADES]
     opacity = [inks[level][3] for level in levels.ravel()]
     assert opacity[4] == 0 < opacity[0] < opacity[1] < opacity[2]

@@ -8,7 +8,6 @@ import warnings
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import geopandas as gpd
 import numpy as np
 import pyogrio
 import shapely
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    import geopandas as gpd
     from numpy.typing import NDArray
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
