@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MEASURES = ("length_m", "height_m", "width_m", "volume_m3", "gap_m", "n_missing")
 """Numbers of rows that are compared."""
 SAME, NEW, GONE = "same", "new", "gone"
+NONE = -1
+"""Position of no row."""
 TOLERANCE = 0.05
 """Metres by which rows are simplified."""
 STEP = 4.0
@@ -44,8 +46,8 @@ class Changes(NamedTuple):
     """Metres to the east and north by which the later survey lies off the earlier one."""
     rows: pd.DataFrame
     """A line a row of the later date, then those that are gone: ``state`` ("same", "new", "gone"), ``label`` and
-    ``earlier`` (its label at that date), ``part_of`` (of the other date, for what was split or joined), and what a row
-    that is the same has gained, ``d_length_m`` and so on."""
+    ``earlier`` (its label at that date), ``part_of`` (label of the other date's row that it was split from or joined
+    to), its numbers, ``length_m`` and so on, and what one that is the same has gained, ``d_length_m`` and so on."""
 
 
 def compare_rows(
@@ -71,33 +73,25 @@ def compare_rows(
     shift = estimate_shift(lines, before, spacing=spacing, overlap=overlap, width=near)
     moved = _move(lines, -shift)
     j, i = match_rows(moved, before, overlap=overlap, width=near).T
-    order = np.argsort(j)
-    j, i = j[order], i[order]
-    same = pd.DataFrame(
-        {"state": SAME, "label": later["label"].to_numpy()[j], "earlier": earlier["label"].to_numpy()[i]}
+    was = np.full(len(lines), NONE)
+    was[j] = i
+    lost = np.setdiff1d(np.arange(len(before)), i)
+    is_now, was = np.append(np.arange(len(lines)), np.full(len(lost), NONE)), np.append(was, lost)
+    state = np.select([is_now == NONE, was == NONE], [GONE, NEW], SAME)
+    labels, labels_before = (
+        np.append(table["label"].to_numpy(dtype=object), np.array([None], dtype=object)) for table in (later, earlier)
     )
+    part_of = np.full(len(state), None, dtype=object)
+    part_of[state == NEW] = labels_before[_part_of(moved[is_now[state == NEW]], before, near)]
+    part_of[state == GONE] = labels[_part_of(before[lost], moved, near)]
+    columns = {"state": state, "label": labels[is_now], "earlier": labels_before[was], "part_of": part_of}
     for name in MEASURES:
-        same[f"d_{name}"] = later[name].to_numpy(dtype=float)[j] - earlier[name].to_numpy(dtype=float)[i]
-    new, gone = np.setdiff1d(np.arange(len(lines)), j), np.setdiff1d(np.arange(len(before)), i)
-    added = pd.DataFrame(
-        {
-            "state": NEW,
-            "label": later["label"].to_numpy()[new],
-            "part_of": _part_of(moved[new], before, earlier["label"].to_numpy(), near),
-        }
-    )
-    lost = pd.DataFrame(
-        {
-            "state": GONE,
-            "earlier": earlier["label"].to_numpy()[gone],
-            "part_of": _part_of(before[gone], moved, later["label"].to_numpy(), near),
-        }
-    )
-    same.index, added.index = pd.Index(j), pd.Index(new)
-    present = pd.concat([part for part in (same, added) if len(part)] or [same]).sort_index()
-    columns = ["state", "label", "earlier", "part_of", *(f"d_{name}" for name in MEASURES)]
-    table = pd.concat([part for part in (present, lost) if len(part)] or [present], ignore_index=True)
-    return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), table.reindex(columns=columns))
+        now, then = (
+            np.append(table[name].to_numpy(dtype=float), np.nan)[places]
+            for table, places in ((later, is_now), (earlier, was))
+        )
+        columns |= {name: np.where(state == GONE, then, now), f"d_{name}": now - then}
+    return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), pd.DataFrame(columns))
 
 
 def estimate_shift(
@@ -124,7 +118,7 @@ def estimate_shift(
     return shift
 
 
-def summarise(changes: Changes, later: gpd.GeoDataFrame, earlier: gpd.GeoDataFrame) -> dict[str, float]:
+def summarise(changes: Changes) -> dict[str, float]:
     """Changes of a parcel: of the rows that are the same, mean height and width by length, sums of the rest.
 
     Returns
@@ -133,17 +127,17 @@ def summarise(changes: Changes, later: gpd.GeoDataFrame, earlier: gpd.GeoDataFra
         ``same``, ``new`` and ``gone`` (numbers of rows), ``d_height_m``, ``d_width_m``, ``d_volume_m3``,
         ``d_volume`` (share of what was), ``d_gap_m`` and ``d_n_missing``; NaN where no row is the same.
     """
-    same = changes.rows[changes.rows["state"] == SAME]
-    length = same["label"].map(dict(zip(later["label"], later["length_m"], strict=True))).astype(float)
-    volume = same["earlier"].map(dict(zip(earlier["label"], earlier["volume_m3"], strict=True))).astype(float).sum()
-    found: dict[str, float] = {state: int((changes.rows["state"] == state).sum()) for state in (SAME, NEW, GONE)}
-    for name in ("height_m", "width_m"):
-        known = same[f"d_{name}"].notna()
-        weights = length[known]
-        found[f"d_{name}"] = float(np.average(same.loc[known, f"d_{name}"], weights=weights)) if known.any() else np.nan
-    for name in ("volume_m3", "gap_m", "n_missing"):
-        found[f"d_{name}"] = float(same[f"d_{name}"].sum()) if len(same) else np.nan
-    return found | {"d_volume": found["d_volume_m3"] / volume if volume > 0 else np.nan}
+    state = changes.rows["state"].to_numpy()
+    found: dict[str, float] = {one: int((state == one).sum()) for one in (SAME, NEW, GONE)}
+    columns = [*MEASURES, *(f"d_{name}" for name in MEASURES)]
+    same = {name: changes.rows[name].to_numpy(dtype=float)[state == SAME] for name in columns}
+    for name in ("d_height_m", "d_width_m"):
+        known = np.isfinite(same[name])
+        found[name] = float(np.average(same[name][known], weights=same["length_m"][known])) if known.any() else np.nan
+    for name in ("d_volume_m3", "d_gap_m", "d_n_missing"):
+        found[name] = float(same[name].sum()) if len(same[name]) else np.nan
+    before = (same["volume_m3"] - same["d_volume_m3"]).sum()
+    return found | {"d_volume": found["d_volume_m3"] / before if before > 0 else np.nan}
 
 
 def _spacing(*tables: gpd.GeoDataFrame) -> float:
@@ -207,14 +201,12 @@ def _solve(
     return shift
 
 
-def _part_of(lines: Lines, others: Lines, labels: NDArray[np.object_], width: float) -> list[str | None]:
-    """Label of the other line along which most of each line runs, if one does for half of it."""
+def _part_of(lines: Lines, others: Lines, width: float) -> NDArray[np.intp]:
+    """Which other line most of each line (n,) runs along, if it does for half of it; else none."""
     if len(lines) == 0 or len(others) == 0:
-        return [None] * len(lines)
+        return np.full(len(lines), NONE)
     i, j = shapely.STRtree(others).query(shapely.buffer(lines, width), predicate="intersects")
     share = np.zeros((len(lines), len(others)))
-    share[i, j] = shapely.length(shapely.intersection(lines[i], shapely.buffer(others[j], width))) / shapely.length(
-        lines[i]
-    )
-    best = share.argmax(axis=1)
-    return [str(labels[k]) if share[row, k] >= 0.5 else None for row, k in enumerate(best)]
+    beside = shapely.intersection(lines[i], shapely.buffer(others[j], width))
+    share[i, j] = shapely.length(beside) / shapely.length(lines[i])
+    return np.where(share.max(axis=1) >= 0.5, share.argmax(axis=1), NONE)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
-    from numpy.typing import NDArray
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
 """What is read of rows."""
@@ -282,31 +281,18 @@ def _compare(rows: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
         return told | {"remark": f"can't be compared ({type(error).__name__})"}
     table = changes.rows
-    numbers = rows.set_index("label")
-    lost = earlier.set_index("label")
-    columns: dict[str, Any] = {
-        name: [word if isinstance(word, str) else None for word in table[name]] for name in table.columns[:4]
-    }
+    columns: dict[str, Any] = {name: table[name].tolist() for name in ("state", "label", "earlier", "part_of")}
     for name, digits in DIGITS.items():
-        now, then = (
-            labels.map(source[name].to_dict()).to_numpy(dtype=float)
-            for labels, source in ((table["label"], numbers), (table["earlier"], lost))
-        )
-        columns[name] = _round(np.where(table["state"] == GONE, then, now), digits)
-        columns[f"d_{name}"] = _round(table[f"d_{name}"].to_numpy(dtype=float), digits)
-        if name == "volume_m3":
-            columns["d_volume"] = _round(table["d_volume_m3"].to_numpy(dtype=float) / then, 4)
-    gone = earlier[earlier["label"].isin(table.loc[table["state"] == GONE, "earlier"])].to_crs(rows.crs)
+        columns |= {part: np.round(table[part], digits).tolist() for part in (name, f"d_{name}")}
+    share = table["d_volume_m3"] / (table["volume_m3"] - table["d_volume_m3"])
+    columns["d_volume"] = np.round(share, 4).tolist()
+    gone = earlier.geometry[earlier["label"].isin(table.loc[table["state"] == GONE, "earlier"])].to_crs(rows.crs)
     return told | {
         "shift": changes.shift,
-        "summary": summarise(changes, rows, earlier),
+        "summary": summarise(changes),
         "rows": columns,
         "gone": gone.translate(*changes.shift),
     }
-
-
-def _round(values: NDArray[np.float64], digits: int) -> list[float]:
-    return list(np.round(values, digits))
 
 
 def _described(product: Product, rows: gpd.GeoDataFrame | None, compared: Mapping[str, Any]) -> dict[str, Any]:

@@ -74,7 +74,7 @@ async function show(view, file, { terrain, rows, selected, whole, near }) {
     if (box.isEmpty()) return;
     const middle = box.getCenter(new Vector3());
     const half = Math.tan((camera.fov * Math.PI) / 360) * Math.min(1, camera.aspect / 1.6);
-    const reach = (0.31 * Math.max(box.getSize(new Vector3()).length(), 6)) / half;
+    const reach = (0.36 * Math.max(box.getSize(new Vector3()).length(), 6)) / half;
     camera.position.copy(middle).addScaledVector(from.normalize(), reach);
     controls.target.copy(middle);
     controls.maxDistance = 2000;
@@ -99,7 +99,7 @@ async function show(view, file, { terrain, rows, selected, whole, near }) {
   function paint() {
     scene.background = new Color(colour("sky"));
     foliage.color.set(colour("foliage"));
-    chosen.color.set(colour("selected"));
+    chosen.color.set(colour("selected")).offsetHSL(0, 0, 0.1);
     ground.material.color.set(colour("soil"));
     draw();
   }

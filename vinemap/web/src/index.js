@@ -108,7 +108,7 @@ function parcelTable() {
 function links(parcel) {
   const words = { report: "report", layers: "GeoPackage", project: "QGIS" };
   const made = Object.entries(words).filter(([kind]) => parcel.files?.[kind]).map(([kind, word]) => element("a", { href: href(parcel, kind) }, word));
-  return element("span", { class: "links" }, ...made.flatMap((link, k) => (k ? [" · ", link] : [link])));
+  return element("span", {}, ...made.flatMap((link, k) => (k ? [" · ", link] : [link])));
 }
 
 function showChanges(parcel, rows) {

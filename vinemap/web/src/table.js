@@ -22,7 +22,7 @@ export function table(columns, { caption, onselect = null, sorted = null } = {})
   const lines = Array.from({ length: n }, (_, k) => {
     const cells = columns.map((column, c) => {
       const shown = column.show(column.values[k], k);
-      const kind = column.text ? "word" : null;
+      const kind = column.text ? (shown.length > 30 ? "word long" : "word") : null;
       if (c > 0) return element("td", { class: kind }, shown);
       const inner = onselect ? element("button", { type: "button", onclick: () => onselect(k) }, shown) : shown;
       return element("th", { scope: "row" }, inner);
