@@ -17,7 +17,7 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test test-qgis check accuracy bench picture tune clean
+.PHONY: help parcel survey nightly test test-qgis check accuracy bench picture tune web clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -68,8 +68,11 @@ picture: $(READY) ## Draw README's picture of a product: make parcel PARCEL=curv
 tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
 	@$(BIN)/python -m vinemap.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")
 
+web: ## Bundle the pages' scripts and style anew, after a change in vinemap/web (needs node and npm)
+	@cd vinemap/web && npm ci --silent && npm run --silent build
+
 clean: ## Remove .venv and the tools' caches; surveys and products stay
-	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist vinemap/web/node_modules
 	@find flows tests vinemap -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY): pyproject.toml configs/constraints.txt

@@ -1,5 +1,6 @@
 """Small vineyards that several tests share."""
 
+import struct
 from pathlib import Path
 
 import geopandas as gpd
@@ -9,8 +10,10 @@ import shapely
 from lasfiles import write_each
 
 from vinemap.cloud import PointCloud
+from vinemap.config import survey_config
 from vinemap.crs import parse_crs
 from vinemap.scenes import hillside, rows_of
+from vinemap.survey import map_survey
 from vinemap.synthetic import Vineyard, simulate, write_survey
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -58,3 +61,34 @@ def three(tmp_path_factory):
     names = [*polygons["name"], "inner A", "empty"]
     gpd.GeoDataFrame({"name": names}, geometry=shapes, crs=polygons.crs).to_file(path.with_name("more.gpkg"))
     return path
+
+
+@pytest.fixture(scope="session")
+def flights(tmp_path_factory):
+    """Folder of the products of two surveys, ``june`` and ``september``, of a vineyard that changes between them.
+
+    Of A's six places for rows the last but one is planted by September and the second is no more; the canopies have
+    grown by 0.2 m, and the later flight lies 0.4 m to the west and 0.3 m to the north of the earlier. There are a
+    parcel of one row, a meadow, and in September a parcel that isn't there.
+    """
+    folder = tmp_path_factory.mktemp("flights")
+    place = np.mean(rows_of(1)[0], axis=0)
+    for name, day, year, kept, height, shift in (
+        ("june", 169, 2026, (0, 1, 2, 3, 5), 1.8, (0.4, -0.3)),
+        ("september", 257, 2026, (0, 2, 3, 4, 5), 2.0, (0.0, 0.0)),
+    ):
+        at = place + shift
+        rows = rows_of(6, length=22, azimuth=33, centre=tuple(at))
+        plots = [
+            Vineyard("A", [rows[k] for k in kept], height=height, dead=0.0, gaps=(3,)),
+            Vineyard("one", rows_of(1, length=15, centre=tuple(at + [35, 0])), height=height),
+            Vineyard("meadow", (), outline=shapely.box(*(at + [25, 15]), *(at + [45, 30]))),
+        ]
+        path = write_survey(simulate(plots, hillside(0.1), name=name, density=130, seed=2), folder / "in" / name)
+        with path.open("r+b") as cloud:  # the date in its header
+            cloud.seek(90)
+            cloud.write(struct.pack("<HH", day, year))
+        parcels = ["A", "one", "meadow", *(["nobody's"] if name == "september" else [])]
+        config = survey_config(survey=name, cloud=path, boundaries=path.with_name("parcels.gpkg"), parcels=parcels)
+        list(map_survey(config, folder / "products" / name))
+    return folder / "products"

@@ -6,7 +6,7 @@ import geopandas as gpd
 
 from vinemap import paths
 
-SURVEYS = ["collection.json", "survey.json", "three_stac.json", "tileset.json"]
+SURVEYS = ["collection.json", "index.html", "survey.json", "three_stac.json", "tileset.json"]
 """Files of a survey, beside the folders of its products."""
 
 

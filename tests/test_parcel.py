@@ -66,7 +66,7 @@ def test_missing_vines_are_gaps(product, vineyard):
 def test_product_is_the_contracts(product):
     folder = product.folder
     record = json.loads((folder / "run.json").read_text())
-    expected = {"A.gpkg", "A.qgz", "A_canopy.glb", "A_stac.json", "tileset.json"}
+    expected = {"A.gpkg", "A.qgz", "A_canopy.glb", "A_report.html", "A_stac.json", "tileset.json"}
     expected |= {f"A_{kind}.{suffix}" for kind in RASTERS for suffix in ("tif", "qml")}
     assert {p.name for p in folder.iterdir()} == expected | {"run.json"}
     assert set(record["files"]) == expected

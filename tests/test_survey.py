@@ -66,7 +66,8 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
     names = sorted(path.name for path in alone.iterdir())
     assert sorted(path.name for path in (folder / parcel).iterdir()) == names
     for name in names:
-        if name not in (paths.RUN, f"{parcel}_stac.json"):  # the survey is named there
+        # The survey is named in the others.
+        if name not in (paths.RUN, f"{parcel}_stac.json", f"{parcel}_report.html"):
             assert content(folder / parcel / name) == content(alone / name), name
     records = [json.loads(paths.run_record(place).read_text()) for place in (folder / parcel, alone)]
     for record in records:
@@ -74,6 +75,7 @@ def test_products_are_those_of_parcels_mapped_alone(mapped, cloud, boundaries, t
         assert len(record.pop("key")) == 64
         assert record.pop("survey") in ("three", None)
         assert record["files"].pop(f"{parcel}_stac.json") > 500
+        assert record["files"].pop(f"{parcel}_report.html") > 500_000
         assert record.pop("seconds")["All"] > 0
     assert records[0] == records[1]
 
@@ -85,7 +87,7 @@ def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
     assert f'{boundaries}: none of its 5 polygons has "nobody\'s" in a column' in outcomes["nobody's"].line()
     assert outcomes["empty"].line().startswith("empty: failed: ")
     assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
-    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS[:1], "inner A", *SURVEYS[1:]]
+    assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS[:2], "inner A", *SURVEYS[2:]]
     assert [path.name for path in folder.parent.iterdir()] == ["products"]
 
 
@@ -101,7 +103,12 @@ def test_earlier_products_outlive_a_failure(cloud, boundaries, tmp_path):
     (tmp_path / "A" / "kept.txt").write_text("kept")
     (outcome,) = job(cloud, tmp_path, parcels=["A"], boundaries=boundaries, job={"limit": 0.01})
     assert outcome.line() == "A: failed: took longer than 0.01 s"
-    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")} == {"A", "A/kept.txt", "survey.json"}
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")} == {
+        "A",
+        "A/kept.txt",
+        "index.html",
+        "survey.json",
+    }
 
 
 def test_a_cloud_that_cannot_be_read_is_the_whole_jobs_fault(cloud, boundaries, tmp_path):
@@ -110,7 +117,7 @@ def test_a_cloud_that_cannot_be_read_is_the_whole_jobs_fault(cloud, boundaries, 
     for path, reason in ((cut, r"cut\.laz: "), (tmp_path / "none.laz", "no such file")):
         with pytest.raises(InputError, match=reason):
             list(job(path, tmp_path / "new" / "out", parcels=["A", "B"], boundaries=boundaries))
-        assert not {path.name for path in tmp_path.rglob("*")} - {"cut.laz", "new", "out", "survey.json"}
+        assert not {path.name for path in tmp_path.rglob("*")} - {"cut.laz", "new", "out", "index.html", "survey.json"}
 
 
 def test_a_folder_that_cannot_be_written(cloud, boundaries, tmp_path):

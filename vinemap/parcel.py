@@ -36,6 +36,7 @@ from vinemap.pdal_engine import check_engine, pdal_versions, read_cloud_pdal
 from vinemap.pieces import read_piece
 from vinemap.product import labelled, parcel_layer, write_product
 from vinemap.recipe import Recipe, recipe_of
+from vinemap.report import parcel_page
 from vinemap.row_field import estimate_row_field, refine_row_field
 from vinemap.row_fit import fit_rows
 from vinemap.row_table import describe_rows, number_rows
@@ -291,6 +292,28 @@ def follow(
         counts |= {name: len(layer) for name, layer in layers.items()}
         modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
         length = round(float(rows["length_m"].sum()), 3)
+        record: dict[str, Any] = {
+            "vinemap": __version__,
+            "key": recipe.key,
+            "survey": recipe.survey,
+            "parcel": parcel,
+            "flown": recipe.flown.isoformat(),
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
+            "inputs": [source.record() for source in recipe.sources],
+            "settings": settings.model_dump(mode="json"),
+            "crs": points.crs.to_string(),
+            "vertical_datum": points.vertical,
+            "origin": origin._asdict(),
+            "counts": counts,
+            "length_m": length,
+            "modelling": modelling.to_dict() if len(model.table) else None,
+            "warnings": notices(rows, seen.chm, layers["parcel"], points.size),
+            "versions": {"python": platform.python_version()}
+            | {name: version(name) for name in LIBRARIES}
+            | (pdal_versions() if with_pdal else {}),
+        }
+        page = parcel_page(record, layers, seen.dtm, seen.chm, paths.canopy_mesh(draft, parcel).read_bytes())
+        paths.report(draft, parcel).write_text(page, encoding="utf-8")
         item = parcel_item(
             draft,
             parcel,
@@ -307,31 +330,12 @@ def follow(
             survey=recipe.survey,
         )
         save(item, paths.stac_item(draft, parcel))
-        warnings = notices(rows, seen.chm, layers["parcel"], points.size)
-        record = {
-            "vinemap": __version__,
-            "key": recipe.key,
-            "survey": recipe.survey,
-            "parcel": parcel,
-            "flown": recipe.flown.isoformat(),
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "inputs": [source.record() for source in recipe.sources],
-            "settings": settings.model_dump(mode="json"),
-            "crs": points.crs.to_string(),
-            "vertical_datum": points.vertical,
-            "origin": origin._asdict(),
-            "counts": counts,
-            "length_m": length,
-            "modelling": modelling.to_dict() if len(model.table) else None,
-            "warnings": warnings,
+        record |= {
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
-            "versions": {"python": platform.python_version()}
-            | {name: version(name) for name in LIBRARIES}
-            | (pdal_versions() if with_pdal else {}),
             "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(warnings))
+    return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(record["warnings"]))
 
 
 class CanopyModel(NamedTuple):

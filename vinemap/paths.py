@@ -166,3 +166,19 @@ def stac_item(folder: Path, name: str) -> Path:
 def stac_collection(folder: Path) -> Path:
     """STAC collection of a survey's products."""
     return folder / "collection.json"
+
+
+def report(folder: Path, parcel: str) -> Path:
+    """Page of a parcel, in its product's folder."""
+    return folder / f"{parcel}_report.html"
+
+
+def index(folder: Path) -> Path:
+    """Page of a survey, in the folder of its products."""
+    return folder / "index.html"
+
+
+def page_part(name: str) -> Path:
+    """A template, script or style that pages are made of: ``report.html``, ``report.js``."""
+    web = Path(__file__).parent / "web"
+    return web / name if name.endswith(".html") else web / "dist" / name

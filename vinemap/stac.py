@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 MEDIA_TYPES = {
     ".glb": "model/gltf-binary",
     ".gpkg": MediaType.GEOPACKAGE,
+    ".html": MediaType.HTML,
     ".geojson": MediaType.GEOJSON,
     ".json": MediaType.JSON,
     ".las": "application/vnd.las",
@@ -108,6 +109,8 @@ def parcel_item(
     for key, (path, title) in files.items():
         if path.exists():
             item.add_asset(key, _asset(path, folder, title))
+    if (page := paths.report(folder, parcel)).exists():
+        item.add_asset("report", _asset(page, folder, "Map, table, plots and canopies in 3D", role="overview"))
     for path in sorted(folder.glob("*.tif")):
         kind = path.stem.removeprefix(f"{parcel}_")
         _add_raster(item, kind, path)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from vinemap import machine, paths
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
 from vinemap.globe import survey_tileset
+from vinemap.index import write_index
 from vinemap.parcel import call, follow
 from vinemap.pieces import split_cloud
 from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
@@ -59,7 +60,7 @@ def map_survey(
 
     The cloud is read once and every point goes to the parcels that hold it. Each parcel is then worked by a process of
     its own: what goes wrong there, a crash or too long a time even, is that parcel's alone. ``survey.json`` in the
-    folder tells at the end what became of each.
+    folder tells at the end what became of each, and ``index.html`` shows it.
 
     Parameters
     ----------
@@ -101,6 +102,7 @@ def map_survey(
                 given = [(source.path, source.record()) for source in plan.sources]
                 products = write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
                 _write_tileset(paths.tileset(folder), products)
+                write_index(folder, config.survey)
 
 
 def _write_tileset(path: Path, products: Sequence[Path]) -> None:

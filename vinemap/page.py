@@ -1,0 +1,140 @@
+"""Pages that need nothing but themselves: one HTML file that holds its data, scripts and style, and asks no network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import math
+import zlib
+from functools import cache
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from vinemap import paths
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+
+LEVEL = 6
+"""Of compression."""
+
+
+def page(
+    name: str,
+    title: str,
+    data: Mapping[str, Any],
+    *,
+    packed: Mapping[str, bytes],
+    scripts: Sequence[str] = (),
+    key: str = "",
+) -> str:
+    """A page as one HTML file.
+
+    Its policy forbids the browser to load anything, and to run any script but those that were bundled with it.
+
+    Parameters
+    ----------
+    name : str
+        Template, style and first script: ``report`` or ``index``.
+    title : str
+        Of the page; as all words of the data, any text.
+    data : mapping
+        What the script shows, as JSON.
+    packed : mapping of str to bytes
+        What it unpacks later, by name.
+    scripts : sequence of str
+        Further scripts, which the first starts when they are needed.
+    key : str
+        Tells what the page was made of, see :func:`page_hash`.
+
+    References
+    ----------
+    https://www.w3.org/TR/CSP3/
+    """
+    parts = [_part(f"{script}.js") for script in (name, *scripts)]
+    style = _part("style.css")
+    policy = (
+        f"default-src 'none'; script-src {' '.join(_hash(part) for part in parts)}; style-src {_hash(style)}; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    later = [
+        f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:], strict=True)
+    ]
+    blocks = [f'<script type="text/plain" id="{key}">{_pack(value)}</script>' for key, value in packed.items()]
+    return Template(_part(f"{name}.html")).substitute(
+        policy=policy,
+        key=html.escape(key),
+        title=html.escape(title),
+        style=style,
+        data=_embedded(data),
+        blocks="\n".join([*blocks, *later]),
+        script=parts[0],
+    )
+
+
+def page_hash(name: str) -> str:
+    """Changes when a page's template, script or style does."""
+    parts = (f"{name}.html", f"{name}.js", "style.css")
+    return hashlib.sha256("".join(map(_part, parts)).encode()).hexdigest()
+
+
+@cache
+def _part(name: str) -> str:
+    return paths.page_part(name).read_text(encoding="utf-8").strip("\n")
+
+
+@cache
+def _hash(part: str) -> str:
+    digest = hashlib.sha256(part.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
+def _embedded(data: Mapping[str, Any]) -> str:
+    """JSON, ASCII alone, that can't end the element it stands in."""
+    return as_json(data).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _pack(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, LEVEL)).decode()
+
+
+def as_json(data: Any) -> str:
+    """Data as JSON, in which what isn't finite is null."""
+    return json.dumps(plain(data), allow_nan=False, separators=(",", ":"))
+
+
+def plain(value: Any) -> Any:
+    """A value of Python's own kinds alone: numpy's numbers and arrays as those, what isn't finite as None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def whole_numbers(values: ArrayLike, *, unit: float) -> list[int | None]:
+    """Values (n,) in whole units, 0.01 for centimetres; None for what isn't finite."""
+    counts = np.asarray(values, dtype=float) / unit
+    return [round(value) if math.isfinite(value) else None for value in counts.tolist()]
+
+
+def polylines(lines: ArrayLike, zero: ArrayLike, *, tolerance: float, digits: int = 2) -> list[list[list[float]]]:
+    """Points of lines or rings in plan, about a point, without those that lie within ``tolerance`` of the others."""
+    simple = shapely.simplify(shapely.force_2d(np.asarray(lines, dtype=object)), tolerance)
+    return [np.round(shapely.get_coordinates(line) - np.asarray(zero), digits).tolist() for line in simple]
+
+
+def rings(polygon: shapely.Geometry, zero: ArrayLike, *, tolerance: float, digits: int = 2) -> list[list[list[float]]]:
+    """Rings of a polygon or several, outer and inner, as :func:`polylines`."""
+    return polylines(shapely.get_rings(shapely.get_parts(polygon)), zero, tolerance=tolerance, digits=digits)

@@ -1,0 +1,48 @@
+// Table 2.1 of the rows, and what lies beyond it.
+import { at, element, number } from "./page.js";
+import { table } from "./table.js";
+
+const ENDS = ["e1", "en"];
+const COLUMNS = [
+  ["length_m", "Length", "m", 2, "In 3D, along the row"],
+  ["orientation_deg", "Orientation", "°", 2, "Mean, anticlockwise from true east"],
+  ["elevation_m", "Elevation", "m", 2, "Mean along the row"],
+  ["elevation_diff_m", "Difference", "m", 2, "Elevation of the end en less that of e1"],
+  ["spacing_m", "Spacing", "m", 2, "To the rows beside it"],
+  ["height_m", "Height", "m", 2, "Of the canopy above ground"],
+  ["bottom_m", "Foliage from", "m", 2, "Height above ground at which foliage begins"],
+  ["width_m", "Width", "m", 2, "Of the canopy"],
+  ["volume_m3", "Volume", "m³", 1, "Of the foliage"],
+  ["volume_m", "Volume a metre", "m³/m", 3, "Volume over length, gaps included"],
+  ["trv_m3_ha", "TRV", "m³/ha", 0, "Tree-row volume"],
+  ["lwa_m2_ha", "LWA", "m²/ha", 0, "Leaf-wall area"],
+  ["gap_m", "Gaps", "m", 2, "Length without vines"],
+  ["n_missing", "Missing", "vines", 0, "Vines missing in the gaps"],
+  ["support", "Support", "", 2, "Share of the length with canopy"],
+  ["confidence", "Confidence", "", 2, "0 to 1"],
+  ["flags", "Flags", "", null, "What is odd beside the neighbours"],
+  ["block", "Block", "", 0, "Rows of one direction and spacing"],
+  ["n_key_points", "Key points", "", 0, "Enhanced key points along the row"],
+  ...ENDS.flatMap((end) => [..."xyz"].map((axis) => [`${end}_${axis}`, `${end} ${axis}`, "m", 2, "In {Main}"])),
+  ...ENDS.flatMap((end) => [["lat", "°", 8], ["lon", "°", 8], ["alt", "m", 2]].map(([axis, unit, digits]) => [`${end}_${axis}`, `${end} ${axis}`, unit, digits, "In WGS 84"])),
+];
+
+export function rowTable(rows, selected) {
+  const columns = COLUMNS.map(([name, title, unit, digits, help]) => ({
+    title, unit, help,
+    values: rows.map((row) => row[name]),
+    text: digits === null,
+    show: digits === null ? (value) => value || "" : (value) => number(value, digits),
+  }));
+  const label = { title: "Row", help: "Number of the row, e1 is its western end", values: rows.map((row) => row.row_id), text: true, show: (_, k) => rows[k].label };
+  const made = table([label, ...columns], { caption: "Rows in numbers", onselect: (k) => selected.set(rows[k]), sorted: 0 });
+  at("table").append(made.element, element("p", { class: "hint" }, "A click on a heading sorts, on a row selects it. e1 is the western end of a row, en the eastern; x, y, z are metres to the east, north and up of the origin of {Main}, lat, lon, alt are WGS 84."));
+  return {
+    select(row) {
+      made.lines.forEach((line, k) => {
+        if (rows[k] === row) line.setAttribute("aria-current", "true");
+        else line.removeAttribute("aria-current");
+      });
+    },
+  };
+}

@@ -1,0 +1,66 @@
+// What the page says: whose parcel, its key numbers, how far to trust them, what they were made of.
+import { at, day, element, facts, number, plural } from "./page.js";
+
+export function showHead({ parcel, survey, flown, warnings, totals, vinemap }) {
+  at("over").textContent = ["Vine rows", survey && `survey ${survey}`, flown && `flown ${day(flown)}`].filter(Boolean).join(" · ");
+  at("title").textContent = parcel;
+  const share = totals.length_m ? `${number((100 * totals.gap_m) / totals.length_m, 1)}% of the length` : "";
+  const ha = totals.area_m2 / 1e4;
+  facts(at("figures"), [
+    ["Rows", number(totals.rows)],
+    ["Total length", number(totals.length_m), "m"],
+    ["Area", number(ha, 2), "ha"],
+    ["Mean spacing", number(totals.spacing_m, 2), "m"],
+    ["Canopy volume", number(totals.volume_m3), "m³", ha && totals.volume_m3 ? `${number(totals.volume_m3 / ha)} m³/ha` : ""],
+    ["Mean height", number(totals.height_m, 2), "m", totals.width_m ? `${number(totals.width_m, 2)} m wide` : ""],
+    ["Missing vines", number(totals.n_missing)],
+    ["Gaps", number(totals.gap_m, 1), "m", share],
+  ]);
+  at("notices").append(
+    warnings?.length
+      ? element("div", { class: "warning", role: "note" },
+          element("strong", {}, warnings.length > 1 ? "Warnings" : "Warning"),
+          element("ul", {}, ...warnings.map((warning) => element("li", {}, warning))))
+      : element("p", { class: "fine" }, "No warnings: the points cover the parcel densely, and no row is doubtful."),
+  );
+  at("footer").textContent = `Made by vinemap ${vinemap} from points alone. This file asks no network for anything: it can be mailed, printed and kept.`;
+}
+
+export function showQuality({ modelling, totals, counts }, rows) {
+  const percent = (value, digits = 1) => number(value === null || value === undefined ? null : 100 * value, digits);
+  const doubtful = rows.filter((row) => row.confidence < 0.5).length;
+  facts(at("quality"), [
+    ["Confidence in rows", number(totals.confidence, 2), "", rows.length ? (doubtful ? `${doubtful} below 0.5` : `lowest ${number(Math.min(...rows.map((row) => row.confidence)), 2)}`) : ""],
+    ["Rows with canopy", percent(totals.support), "%", "of their length"],
+    ["Well modelled", percent(modelling?.good), "%", "of the foliage’s cross-section"],
+    ["Under-modelled", percent(modelling?.under), "%", "foliage left out"],
+    ["Over-modelled", percent(modelling?.over), "%", "added around it"],
+    ["Complexity reduction", number(modelling?.reduction, 3), "", "after Table 3.1"],
+    ["Quality score", number(modelling?.quality, 3), "", "1 is best"],
+    ["Points", number((counts?.points ?? NaN) / 1e6, 2), "million", `${plural(counts?.sections ?? 0, "canopy section")}`],
+  ]);
+}
+
+export function showRecord({ inputs, settings, versions, vinemap, crs, vertical_datum, origin, flown, counts }) {
+  const line = (term, ...shown) => element("div", {}, element("dt", {}, term), element("dd", {}, ...shown));
+  const code = (text) => element("code", {}, text);
+  const files = (inputs ?? []).flatMap((input) => [
+    line(input.file, `${number(input.bytes)} bytes, SHA-256 `, code(input.sha256)),
+  ]);
+  const stages = Object.entries(settings ?? {}).map(([stage, options]) =>
+    line(stage, ...Object.entries(options).flatMap(([name, value], k) => [k ? ", " : "", code(`${name}: ${JSON.stringify(value)}`)])));
+  at("record").append(
+    element("h3", {}, "Place"),
+    element("dl", {},
+      line("Coordinate system", crs ?? "–"),
+      line("Heights", vertical_datum ?? "the cloud’s own vertical datum, which it doesn’t name"),
+      origin ? line("Origin of {Main}", `${number(origin.lat, 9)}° N, ${number(origin.lon, 9)}° E, ${number(origin.alt, 3)} m`) : null,
+      line("Flown", flown ? day(flown) : "–")),
+    element("h3", {}, "Inputs"), element("dl", {}, ...files),
+    element("h3", {}, "Settings"), element("dl", {}, ...stages),
+    element("h3", {}, "Counts"),
+    element("dl", {}, ...Object.entries(counts ?? {}).map(([name, n]) => line(name.replaceAll("_", " "), number(n)))),
+    element("h3", {}, "Versions"),
+    element("dl", {}, line("vinemap", vinemap), ...Object.entries(versions ?? {}).map(([name, version]) => line(name, version))),
+  );
+}
