@@ -179,7 +179,7 @@ def test_a_survey_tells_what_became_of_each_parcel(flights):
     assert parcels["nobody's"]["state"] == "failed"
     assert "nobody's" in parcels["nobody's"]["reason"]
     assert (parcels["A"]["state"], parcels["A"]["rows"], parcels["meadow"]["rows"]) == ("done", 5, 0)
-    assert parcels["A"]["files"] == {"report": "A_report.html", "layers": "A.gpkg"}
+    assert parcels["A"]["files"] == {"report": "A_report.html", "layers": "A.gpkg", "project": "A.qgz"}
     assert page.data()["flown"][0][:10] == "2026-09-14"
     assert [len(lines) for lines in json.loads(page.unpacked("details"))["lines"].values()] == [5, 0, 1]
 

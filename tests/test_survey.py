@@ -22,6 +22,7 @@ from vinemap.las import read_cloud
 from vinemap.parcel import map_parcel
 from vinemap.pieces import read_piece, split_cloud
 from vinemap.plan import CURRENT, DONE, FAILED
+from vinemap.recipe import product_in
 from vinemap.survey import map_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_boundary
@@ -150,6 +151,7 @@ def test_the_longest_names(cloud, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([*names, *SURVEYS])
     for name in names:
         assert len(gpd.read_file(paths.geopackage(tmp_path / "out" / name, name), layer="rows")) > 0
+        assert product_in(tmp_path / "out" / name)
     assert {outcome.state for outcome in job(cloud, tmp_path / "out", **options)} == {CURRENT}
 
 
