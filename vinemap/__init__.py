@@ -8,4 +8,4 @@ The stages are ``ground``, ``row_field``, ``key_points``, ``clustering``, ``curv
 ``sections``, ``canopy``, ``cgon`` (meshes). No stage opens a file; no stage imports another.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
