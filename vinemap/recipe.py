@@ -133,13 +133,13 @@ class Recipe(NamedTuple):
         polygon = None
         if self.boundary:
             shape, crs = self.boundary
-            polygon = [shapely.to_wkb(shapely.normalize(shape), hex=True), crs.to_wkt()]
+            polygon = [shapely.to_wkb(shapely.normalize(shape), hex=True), crs.to_string()]
         parts = {
             "vinemap": __version__,
             "parcel": self.parcel,
             "cloud": self.sources[0].sha256,
             "polygon": polygon,
-            "crs": self.crs.to_wkt() if self.crs else None,
+            "crs": self.crs.to_string() if self.crs else None,
             "origin": self.origin,
             "settings": self.settings.model_dump(mode="json"),
             "survey": self.survey,
