@@ -45,6 +45,18 @@ def test_outline_is_the_ground_that_rows_take():
     assert outline_blocks(group_blocks(rows_frame([]))).empty
 
 
+@pytest.mark.parametrize("seed", [181, 189, 227])
+def test_an_outline_holds_rows_whose_ends_are_ragged(seed):
+    rng = np.random.default_rng(seed)
+    lines = []
+    for k in range(9):
+        first, last = rng.uniform(0, 0.5, 2)
+        lines.append([(first, 2.6 * k), (10 - last, 2.6 * k + rng.uniform(-0.1, 0.1))])
+    rows = rows_frame(lines, rng.uniform(2.58, 2.63, 9), block=1)
+    outline = outline_blocks(rows).union_all()
+    assert rows.difference(outline).length.max() < 0.02
+
+
 def gaps_of(rng, spacing, n_rows=15, n_vines=100, dead=0.05, jitter=0.05):
     records = []
     for row in range(1, n_rows + 1):

@@ -196,6 +196,17 @@ def test_isoxml(exported, rows, lanes, outline):
     assert len(set(numbers)) == len(lanes) + len(rows)
 
 
+def test_isoxml_of_a_long_name(tmp_path, product):
+    folder = few(product, tmp_path / "long", 2)
+    record = json.loads((folder / "run.json").read_text())
+    name = "Vigna Superiore di San Lorenzo in Collina presso la Cascina Alta"
+    (folder / "run.json").write_text(json.dumps(record | {"parcel": name}))
+    (folder / f"{NAME}.gpkg").rename(folder / f"{name}.gpkg")
+    list(export_products([folder], tmp_path / "out", formats=["isoxml"], lines="both"))
+    root = ET.parse(tmp_path / "out" / name / "isoxml" / "TASKDATA" / "TASKDATA.XML").getroot()
+    assert [group.get("B") for group in root.iter("GGP")] == [f"{name[:26]} lanes", f"{name[:27]} rows"]
+
+
 def points(line):
     return [(float(point.get("D")), float(point.get("C"))) for point in line.findall("PNT")]
 

@@ -76,6 +76,16 @@ def test_a_row_without_canopy_is_in_the_lowest_class():
     assert float(renderer.find("ranges/range").get("lower")) < 0
 
 
+def test_rows_bear_their_numbers_on_the_map():
+    rows = gpd.GeoDataFrame(
+        {"row_id": [12], "label": ["12 Vigna di San Lorenzo"], "length_m": [100.0], "volume_m3": [90.0]},
+        geometry=[shapely.LineString([(0, 0), (100, 0)])],
+        crs=32632,
+    )
+    (text,) = ET.fromstring(vector_style("rows", rows).qml()).iter("text-style")
+    assert text.get("fieldName") == "row_id"
+
+
 @pytest.mark.parametrize("kind", ["dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood"])
 @pytest.mark.parametrize("values", [np.full((2, 2), np.nan), np.full((2, 2), 3.0), np.linspace(1, 4, 9).reshape(3, 3)])
 def test_colours_of_rasters_rise(kind, values):

@@ -64,7 +64,7 @@ def outline_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         half = 0.5 * members["spacing_m"].to_numpy()
         strips = shapely.buffer(shapely.force_2d(members.geometry.to_numpy()), half, cap_style="flat")
         closed = shapely.buffer(shapely.union_all(strips), half.max(), join_style="mitre")
-        closed = shapely.buffer(closed, -half.max(), join_style="mitre")
+        closed = shapely.buffer(closed, -half.max())
         parts = [shapely.Polygon(part.exterior) for part in shapely.get_parts(closed)]
         polygons.append(shapely.multipolygons(parts))
         blocks.append(block)

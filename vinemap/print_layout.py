@@ -17,6 +17,8 @@ MAP = (10.0, 26.0, 212.0, 174.0)
 COLUMN = 228.0
 """Left of what stands beside the map, mm."""
 SCALES = tuple(n * 10**k for k in (2, 3, 4) for n in (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8))
+LETTERS = 36
+"""Of a title at full size; as many fit even where all are as wide as high."""
 MARGIN = 1.06
 """What is shown over the parcel's size."""
 BAR = 25.0
@@ -57,7 +59,7 @@ def print_layout(
         "Layout",
         node("PageCollection", single_symbol({"color": "255,255,255,255", "outline_style": "no"}), _page()),
         _map(bounds, scale),
-        _text(title, (MAP[0], 7, MAP[2], 10), size=20, bold=True),
+        _text(title, (MAP[0], 7, PAGE[0] - MAP[0] - 30, 10), size=min(20, LETTERS * 20 / len(title)), bold=True),
         _text(" · ".join(lines["head"]), (MAP[0], 17.5, MAP[2], 7), size=10),
         _legend(legend),
         _scale_bar(scale),
@@ -99,7 +101,8 @@ def _map(bounds: Sequence[float], scale: int) -> Element:
 def _text(text: str, place: tuple[float, float, float, float], *, size: float, bold: bool = False) -> Element:
     font = node("LabelFont", description=_font(size, bold=bold), style="")
     ink = node("FontColor", red=29, green=43, blue=36, alpha=255)
-    return _item(LABEL, place, font, ink, labelText=text, htmlState=0, halign=1, valign=32, marginX=0, marginY=0)
+    literal = text.replace("[%", "[%'['%]%")  # else QGIS takes it for an expression
+    return _item(LABEL, place, font, ink, labelText=literal, htmlState=0, halign=1, valign=32, marginX=0, marginY=0)
 
 
 def _font(size: float, *, bold: bool = False) -> str:

@@ -113,7 +113,11 @@ def project(
     canvas = [node("units", "meters"), extent, node("rotation", "0"), node("destinationsrs", _srs(crs))]
     lines = {"head": _totals(layers["parcel"]), "foot": [crs.name, *notes]}
     listed = {entry.name: entry for group in TREE.values() for entry in group}
-    legend = [(_id(listed[name]), listed[name].title, "vector" if name in layers else "raster") for name in LEGEND]
+    legend = [
+        (_id(listed[name]), listed[name].title, "vector" if name in layers else "raster")
+        for name in LEGEND
+        if name not in layers or len(layers[name])
+    ]
     root = node(
         "qgis",
         node("homePath", path=""),
@@ -140,9 +144,9 @@ def project(
 def _totals(parcel: gpd.GeoDataFrame) -> list[str]:
     """The parcel in a few words."""
     total = parcel[["n_rows", "rows_length_m", "area_m2", "n_missing"]].sum()
-    missing = int(total["n_missing"])
+    n, missing = int(total["n_rows"]), int(total["n_missing"])
     return [
-        f"{int(total['n_rows'])} rows",
+        f"{n or 'no'} row{'' if n == 1 else 's'}",
         f"{total['rows_length_m']:,.0f} m in all",
         f"{total['area_m2'] / 1e4:.2f} ha",
         f"{missing or 'no'} missing {'vine' if missing == 1 else 'vines'}",

@@ -156,7 +156,7 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
     if layer == "rows":
         # Rows are drawn in the grid's frame, and their attribute is from true east.
         direction = "degrees(azimuth(start_point($geometry), end_point($geometry))) - 90"
-        body.append(labels_at_start("label", rotation=direction, scale=LABEL_SCALE, colour=INK))
+        body.append(labels_at_start("row_id", rotation=direction, scale=LABEL_SCALE, colour=INK))
         attributes["labelsEnabled"] = "1"
     if layer in MAP_TIPS:
         body.append(node("mapTip", MAP_TIPS[layer]))

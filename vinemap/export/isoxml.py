@@ -46,7 +46,7 @@ def write_isoxml(field: Field, folder: Path, *, lines: str) -> None:
     groups = [
         iso.GuidanceGroup(
             id=f"GGP{k}",
-            designator=f"{field.parcel} {kind}s"[-LONGEST:],
+            designator=f"{field.parcel[: LONGEST - len(kind) - 2]} {kind}s",
             guidance_patterns=[_pattern(line, convert) for _, line in members.iterrows()],
         )
         for k, (kind, members) in enumerate(table.groupby("kind", sort=False), start=1)
