@@ -200,7 +200,7 @@ def _describe(
     mean = float(width.mean()) if len(width) else float(rows["spacing_m"].iloc[(right or left)[0]])
     line = _driven(course.xyz, headland, mean / 2, tree)
     return {
-        "label": "-".join(ordered) if len(ordered) == 2 else f"beside {ordered[0]}",
+        "label": "-".join(ordered) if len(ordered) == 2 else f"{'left' if right else 'right'} of {ordered[0]}",
         "block": rows["block"].iloc[(right or left)[0]],
         "right_rows": names[0],
         "left_rows": names[1],

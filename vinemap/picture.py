@@ -138,7 +138,7 @@ def _ground(product: Path, parcel: str) -> Facets:
 def _canopies(product: Path, parcel: str) -> Facets:
     """Triangles (n, 3, 3) of the canopies, and their colour."""
     meshes = read_glb(paths.canopy_mesh(product, parcel)).meshes
-    return np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]), FOLIAGE
+    return np.concatenate([np.empty((0, 3, 3)), *(mesh.vertices[mesh.faces] for mesh in meshes)]), FOLIAGE
 
 
 @click.command()

@@ -21,6 +21,7 @@ LETTERS = 36
 """Of a title at full size; as many fit even where all are as wide as high."""
 MARGIN = 1.06
 """What is shown over the parcel's size."""
+INK = "29,43,36,255"
 BAR = 25.0
 """Least length of a half of the scale bar, mm."""
 MAP_ITEM, PICTURE, LABEL, LEGEND, SCALE_BAR, PAGE_ITEM = (str(65638 + k) for k in (1, 2, 3, 4, 8, 0))
@@ -158,7 +159,7 @@ def _scale_bar(scale: int) -> Element:
     return _item(
         SCALE_BAR,
         (COLUMN, 155, 2 * millimetres + 8, 12),
-        node("text-style", fontFamily="Sans Serif", fontSize=8, fontSizeUnit="Point", textColor="29,43,36,255"),
+        node("text-style", fontFamily="Sans Serif", fontSize=8, fontSizeUnit="Point", textColor=INK, textOpacity=1),
         node("fillColor", red=29, green=43, blue=36, alpha=255),
         node("fillColor2", red=255, green=255, blue=255, alpha=255),
         node("strokeColor", red=29, green=43, blue=36, alpha=255),

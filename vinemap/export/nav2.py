@@ -13,7 +13,6 @@ import numpy as np
 import shapely
 
 from vinemap import paths
-from vinemap.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,13 +55,9 @@ def write_nav2(field: Field, folder: Path, *, frame: str, grid: bool) -> None:
 
     Raises
     ------
-    InputError
-        If there are no lanes.
     OSError
         If it can't be written.
     """
-    if len(field.lanes) == 0:
-        raise InputError(f"{field.parcel}: a route graph needs lanes: leave --lines rows out")
     lanes, rows = field.plane(field.lanes, grid=grid), field.plane(field.rows, grid=grid)
     vertices = [shapely.get_coordinates(line) for line in lanes.geometry]
     first = np.cumsum([0, *map(len, vertices)]).tolist()

@@ -66,6 +66,8 @@ def export_products(
     OutputError
         If nothing can be written there.
     """
+    if "nav2" in formats and lines == "rows":
+        raise InputError("nav2 needs lanes: leave --lines rows out, or name the other formats")
     wanted = lines if set(formats) - set(MESHES) else "rows"
     fields = [read_field(product, lines=wanted, headland=headland, outer=outer) for product in products]
     names = [field.parcel for field in fields]
