@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Options)
 T = TypeVar("T")
 
-FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]')
-"""Characters that a name of a file can't have on one system or another."""
+FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]')
+"""Characters that a name of a file can't have on one system or another, or that GDAL's readers take for their own."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
 _short = reprlib.Repr()
