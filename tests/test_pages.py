@@ -278,6 +278,23 @@ def test_junk_beside_a_survey_costs_nothing(copy):
     assert parcels["meadow"]["warnings"][-1] == "its GeoPackage can't be read"
 
 
+def test_odd_products_of_its_own_cost_a_survey_no_page(copy):
+    folder = copy / "september"
+    layers = paths.geopackage(folder / "A", "A")
+    rows = gpd.read_file(layers, layer="rows").assign(height_m="tall")
+    layers.unlink()
+    rows.to_file(layers, layer="rows")
+    item = paths.stac_item(folder / "one", "one")
+    shape = {"type": "Polygon", "coordinates": [[[1e6, 4e6], [2e6, 4e6], [2e6, 5e6], [1e6, 4e6]]]}
+    item.write_text(json.dumps(json.loads(item.read_text()) | {"geometry": shape}))
+    paths.index(folder).unlink()
+    assert write_index(folder, "september")
+    parcels = by_parcel(survey_index(folder))
+    assert parcels["A"]["warnings"][-1] == "its GeoPackage can't be read"
+    assert "outline" not in parcels["one"]
+    assert parcels["meadow"]["rows"] == 0
+
+
 def test_a_survey_without_any_product_has_a_page_of_what_failed(tmp_path):
     assert not write_index(tmp_path, "s")
     record = {"parcels": [{"parcel": "<b>", "state": "failed", "reason": "no </script>"}]}

@@ -249,9 +249,9 @@ def test_folder_that_cannot_be_written(tmp_path):
 def test_a_folder_whose_path_would_be_cut(tmp_path):
     """A GeoPackage would be written to what follows the "!", or nowhere."""
     folder = tmp_path / "Go!" / "products"
-    with pytest.raises(OutputError, match="Go!.*choose another folder"):
+    with pytest.raises(OutputError, match=r"Go!.*choose another folder"):
         publish(folder / "F")
-    with pytest.raises(OutputError, match="Go!.*choose another folder"), store.workshop(folder):
+    with pytest.raises(OutputError, match=r"Go!.*choose another folder"), store.workshop(folder):
         pass
     assert names(tmp_path) == []
 

@@ -26,7 +26,7 @@ from vinemap.config import check_name
 from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
-from vinemap.errors import InputError
+from vinemap.errors import InputError, own_fault
 from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
@@ -312,8 +312,7 @@ def follow(
             | {name: version(name) for name in LIBRARIES}
             | (pdal_versions() if with_pdal else {}),
         }
-        page = parcel_page(record, layers, seen.dtm, seen.chm, paths.canopy_mesh(draft, parcel).read_bytes())
-        paths.report(draft, parcel).write_text(page, encoding="utf-8")
+        record["warnings"] += _write_page(draft, record, layers, seen)
         item = parcel_item(
             draft,
             parcel,
@@ -336,6 +335,18 @@ def follow(
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
     return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(record["warnings"]))
+
+
+def _write_page(folder: Path, record: dict[str, Any], layers: dict[str, gpd.GeoDataFrame], seen: RowMap) -> list[str]:
+    """Write a product's page, or tell why there is none: a fault of our own in a page costs no product."""
+    parcel = record["parcel"]
+    canopies = paths.canopy_mesh(folder, parcel).read_bytes()
+    try:
+        page = parcel_page(record, layers, seen.dtm, seen.chm, canopies)
+    except Exception as error:  # noqa: BLE001 - as said
+        return [f"it has no page: {own_fault(error)}"]
+    paths.report(folder, parcel).write_text(page, encoding="utf-8")
+    return []
 
 
 class CanopyModel(NamedTuple):
