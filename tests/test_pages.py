@@ -144,7 +144,13 @@ def test_words_of_others_stay_words(tmp_path):
     made = Page(path)
     assert made.data() == {"parcel": odd}
     assert [text for ((tag, _), text) in made.texts if tag == "title"] == [odd]
-    assert sum(tag == "script" for tag, _ in made.found) == 3
+    assert sum(tag == "script" for tag, _ in made.found) == 4
+
+
+@pytest.mark.parametrize("name", ["A/A_report.html", "index.html"])
+def test_a_page_holds_the_licences_of_what_is_bundled_in_it(flights, name):
+    text = Page(flights / "september" / name).text(id="licences")
+    assert text.strip() == (WEB / "dist" / "LICENSES.txt").read_text().strip()
 
 
 def test_the_picture_tells_heights():
