@@ -251,7 +251,7 @@ def test_the_survey_shows_parcels_and_changes(flights, open_page):
 def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):
     folder = tmp_path / "s"
     folder.mkdir()
-    odd = "<img src=x onerror=alert(1)></script>"
+    odd = f"<img src=x onerror=alert(1)></script>{'/folder' * 30}"
     paths.survey_record(folder).write_text(json.dumps({"parcels": [{"parcel": odd, "state": "failed", "reason": odd}]}))
     from vinemap.index import write_index
 
@@ -260,3 +260,5 @@ def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):
     assert column(browser, "Parcel")[1] == [odd]
     assert browser.find_element(By.ID, "title").text == "</title><script>alert(2)</script>"
     assert not browser.find_elements(By.TAG_NAME, "img")
+    cell = browser.find_element(By.CSS_SELECTOR, "#table td.long")
+    assert cell.get_property("scrollWidth") <= cell.get_property("clientWidth")
