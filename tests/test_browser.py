@@ -14,6 +14,7 @@ selenium = pytest.importorskip("selenium", reason="needs selenium")
 from selenium.webdriver import Chrome, ChromeOptions  # noqa: E402
 from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 FLAGS = """--headless=new --no-sandbox --disable-quic --no-first-run --disable-background-networking
     --disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader""".split()
@@ -143,6 +144,15 @@ def test_a_row_is_selected_everywhere(flights, open_page):
     assert selected(browser) == ["1 A"]
 
 
+def test_keys_get_past_the_map_whatever_number_of_rows_it_has(flights, open_page):
+    browser = open_page(page_of(flights, "A"))
+    browser.find_element(By.ID, "map").send_keys(Keys.TAB)
+    assert browser.switch_to.active_element.get_attribute("aria-label") == "Zoom in"
+    chosen = browser.find_element(By.ID, "row")
+    chosen.send_keys(Keys.ARROW_DOWN)
+    assert selected(browser) == ["2 A"]
+
+
 def test_the_address_names_a_row(flights, open_page):
     assert selected(open_page(page_of(flights, "A"), anchor="#row-5")) == ["5 A"]
 
@@ -201,6 +211,15 @@ def test_a_phone_shows_the_page_in_its_width(flights, open_page, page):
     assert browser.execute_script(script)
 
 
+def test_a_long_name_stays_within_a_phone(flights, open_page, tmp_path):
+    page, name = page_of(flights, "A").read_text(encoding="utf-8"), "Vigna del parroco, dietro la chiesa"
+    path = tmp_path / "long.html"
+    path.write_text(page.replace(' A"', f' {name}"'), encoding="utf-8")
+    browser = open_page(path, width=390, height=844)
+    assert selected(browser) == [f"1 {name}"]
+    assert browser.execute_script("return document.documentElement.scrollWidth") == 390
+
+
 def test_a_parcel_without_rows_says_so(flights, open_page):
     browser = open_page(page_of(flights, "meadow"))
     assert "No vine row was found" in browser.find_element(By.ID, "rows").text
@@ -232,7 +251,7 @@ def test_the_survey_shows_parcels_and_changes(flights, open_page):
 def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):
     folder = tmp_path / "s"
     folder.mkdir()
-    odd = "<img src=x onerror=alert(1)></script>"
+    odd = f"<img src=x onerror=alert(1)></script>{'/folder' * 30}"
     paths.survey_record(folder).write_text(json.dumps({"parcels": [{"parcel": odd, "state": "failed", "reason": odd}]}))
     from vinemap.index import write_index
 
@@ -241,3 +260,5 @@ def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):
     assert column(browser, "Parcel")[1] == [odd]
     assert browser.find_element(By.ID, "title").text == "</title><script>alert(2)</script>"
     assert not browser.find_elements(By.TAG_NAME, "img")
+    cell = browser.find_element(By.CSS_SELECTOR, "#table td.long")
+    assert cell.get_property("scrollWidth") <= cell.get_property("clientWidth")

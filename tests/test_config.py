@@ -78,7 +78,9 @@ def test_unknown_parcel_suggests_the_nearest(write):
         choose_parcel(config, "zzz")
 
 
-@pytest.mark.parametrize("name", ["../F", "a/b", "a\\b", "", ".hidden", "a" * 80, "con:", "x\n", "end.", "a%20b"])
+@pytest.mark.parametrize(
+    "name", ["../F", "a/b", "a\\b", "", ".hidden", "a" * 80, "con:", "x\n", "end.", "Go!", "a%20b"]
+)
 def test_names_with_characters_of_paths(name):
     with pytest.raises(ConfigError, match="can't name a file"):
         check_name(name)

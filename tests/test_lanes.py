@@ -147,7 +147,7 @@ def test_blocks_in_order_and_short_of_each_others_rows():
     across = [np.column_stack([np.full(23, x), np.arange(-3, 8.5, 0.5), np.zeros(23)]) for x in (34, 36.5)]
     rows = field(row(0, 30, 0), row(0, 30, 2.5), row(0, 30, 5), *across, block=[1, 1, 1, 2, 2])
     lanes = lanes_between(rows, headland=6, outer=True)
-    assert labels(lanes) == ["right of 1", "1-2", "2-3", "left of 3", "right of 4", "4-5", "left of 5"]
+    assert labels(lanes) == ["right of 1", "1-2", "2-3", "left of 3", "left of 4", "4-5", "right of 5"]
     assert lanes["block"].tolist() == [1, 1, 1, 1, 2, 2, 2]
     assert ends(lanes)[:4, 0, 0] == pytest.approx(-6)
     assert ends(lanes)[:4, 1, 0] == pytest.approx(34 - 1.25)

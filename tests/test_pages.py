@@ -144,7 +144,13 @@ def test_words_of_others_stay_words(tmp_path):
     made = Page(path)
     assert made.data() == {"parcel": odd}
     assert [text for ((tag, _), text) in made.texts if tag == "title"] == [odd]
-    assert sum(tag == "script" for tag, _ in made.found) == 3
+    assert sum(tag == "script" for tag, _ in made.found) == 4
+
+
+@pytest.mark.parametrize("name", ["A/A_report.html", "index.html"])
+def test_a_page_holds_the_licences_of_what_is_bundled_in_it(flights, name):
+    text = Page(flights / "september" / name).text(id="licences")
+    assert text.strip() == (WEB / "dist" / "LICENSES.txt").read_text().strip()
 
 
 def test_the_picture_tells_heights():
@@ -276,6 +282,23 @@ def test_junk_beside_a_survey_costs_nothing(copy):
     assert parcels["A"]["remark"] == "rows of the earlier survey can't be read"
     assert "since" not in parcels["one"]
     assert parcels["meadow"]["warnings"][-1] == "its GeoPackage can't be read"
+
+
+def test_odd_products_of_its_own_cost_a_survey_no_page(copy):
+    folder = copy / "september"
+    layers = paths.geopackage(folder / "A", "A")
+    rows = gpd.read_file(layers, layer="rows").assign(height_m="tall")
+    layers.unlink()
+    rows.to_file(layers, layer="rows")
+    item = paths.stac_item(folder / "one", "one")
+    shape = {"type": "Polygon", "coordinates": [[[1e6, 4e6], [2e6, 4e6], [2e6, 5e6], [1e6, 4e6]]]}
+    item.write_text(json.dumps(json.loads(item.read_text()) | {"geometry": shape}))
+    paths.index(folder).unlink()
+    assert write_index(folder, "september")
+    parcels = by_parcel(survey_index(folder))
+    assert parcels["A"]["warnings"][-1] == "its GeoPackage can't be read"
+    assert "outline" not in parcels["one"]
+    assert parcels["meadow"]["rows"] == 0
 
 
 def test_a_survey_without_any_product_has_a_page_of_what_failed(tmp_path):

@@ -157,6 +157,18 @@ def test_nothing_is_a_product_of_empty_layers(tmp_path):
     assert not paths.tileset(tmp_path / "out").exists()
 
 
+def test_a_fault_in_the_page_costs_no_product(tmp_path, survey, product, monkeypatch):
+    def faulty(*args):
+        raise ZeroDivisionError("of the page")
+
+    monkeypatch.setattr("vinemap.parcel.parcel_page", faulty)
+    summary = map_parcel(survey, tmp_path / "A", parcel="A", boundary=survey.parent / "parcels.gpkg")
+    assert "it has no page: a fault of vinemap's own (ZeroDivisionError: of the page)" in summary.line()
+    files = {path.name for path in product.folder.iterdir()} - {"A_report.html"}
+    assert {path.name for path in (tmp_path / "A").iterdir()} == files
+    assert "report" not in json.loads(paths.stac_item(tmp_path / "A", "A").read_text())["assets"]
+
+
 def test_bad_input_leaves_nothing(tmp_path, survey):
     with pytest.raises(InputError):
         map_parcel(tmp_path / "none.laz", tmp_path / "out", parcel="A")

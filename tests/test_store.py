@@ -246,6 +246,16 @@ def test_folder_that_cannot_be_written(tmp_path):
     assert names(tmp_path) == ["file"]
 
 
+def test_a_folder_whose_path_would_be_cut(tmp_path):
+    """A GeoPackage would be written to what follows the "!", or nowhere."""
+    folder = tmp_path / "Go!" / "products"
+    with pytest.raises(OutputError, match=r"Go!.*choose another folder"):
+        publish(folder / "F")
+    with pytest.raises(OutputError, match=r"Go!.*choose another folder"), store.workshop(folder):
+        pass
+    assert names(tmp_path) == []
+
+
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
 def test_folder_that_may_only_be_read(tmp_path):
     (tmp_path / "mine").mkdir(mode=0o555)

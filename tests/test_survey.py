@@ -285,3 +285,23 @@ def test_a_job_that_is_killed_loses_nothing(cloud, tmp_path):
 
 def part(files, folder):
     return {name: content for name, content in files.items() if name.startswith(f"{folder}/")}
+
+
+def test_a_fault_in_the_page_hides_no_outcome_nor_error(cloud, boundaries, tmp_path, monkeypatch):
+    def faulty(*args):
+        raise ZeroDivisionError("of the page")
+
+    monkeypatch.setattr("vinemap.survey.write_index", faulty)
+    said = pytest.warns(RuntimeWarning, match=r"index\.html can't be written: a fault .*of the page")
+    with said:
+        (outcome,) = job(cloud, tmp_path, boundaries=boundaries, parcels=["nobody's"])
+    assert outcome.state == FAILED
+
+    def broken(*args, **options):
+        raise InputError("the cloud is broken")
+        yield
+
+    monkeypatch.setattr("vinemap.survey._work", broken)
+    with said, pytest.raises(InputError, match="the cloud is broken"):
+        list(job(cloud, tmp_path, boundaries=boundaries, parcels=["A"]))
+    assert json.loads(paths.survey_record(tmp_path).read_text())["parcels"][0]["state"] == FAILED

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Options)
 T = TypeVar("T")
 
-FORBIDDEN = re.compile(r'[/\\:*?"<>|\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%[0-9a-fA-F]{2}')
-"""What a name of a file can't have on one system or another; QGIS takes %20 in a GeoPackage's for a space."""
+FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%[0-9a-fA-F]{2}')
+"""What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
 _short = reprlib.Repr()

@@ -122,7 +122,8 @@ def read_products(folder: Path) -> Iterator[Product]:
                 {kind: path.name for kind, path in linked.items() if path.name in record["files"]},
                 as_json([record["key"], record["files"]]),
             )
-            if product.flown.tzinfo and not shapely.is_empty(outline):
+            west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
+            if product.flown.tzinfo and -180 <= west <= east <= 180 and -90 <= south <= north <= 90:
                 yield product
         except (OSError, ValueError, KeyError, TypeError, AttributeError, shapely.errors.ShapelyError):
             continue
@@ -265,6 +266,7 @@ def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
     path = paths.geopackage(folder, parcel)
     try:
         rows = pyogrio.read_dataframe(path, layer="rows", columns=list(COLUMNS))
+        rows = rows.astype(dict.fromkeys(("spacing_m", *MEASURES), float))
         usable = set(COLUMNS) <= set(rows.columns) and rows.crs is not None
         lines = rows[(rows.geom_type == "LineString") & (rows.length > 0)] if usable else None
     except Exception:  # noqa: BLE001 - whatever GDAL makes of a file that isn't ours

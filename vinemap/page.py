@@ -68,13 +68,14 @@ def page(
         f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:], strict=True)
     ]
     blocks = [f'<script type="text/plain" id="{key}">{_pack(value)}</script>' for key, value in packed.items()]
+    licences = f'<script type="text/plain" id="licences">\n{_part("LICENSES.txt")}\n</script>'
     return Template(_part(f"{name}.html")).substitute(
         policy=policy,
         key=html.escape(key),
         title=html.escape(title),
         style=style,
         data=_embedded(data),
-        blocks="\n".join([*blocks, *later]),
+        blocks="\n".join([*blocks, *later, licences]),
         script=parts[0],
     )
 

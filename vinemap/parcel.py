@@ -26,7 +26,7 @@ from vinemap.config import check_name
 from vinemap.cover import canopy_cover
 from vinemap.crs import Origin, to_main, to_wgs84
 from vinemap.curves import trace_rows
-from vinemap.errors import InputError
+from vinemap.errors import InputError, own_fault
 from vinemap.ground import block_side, canopy_height_model, terrain_model
 from vinemap.key_points import detect_key_points
 from vinemap.las import read_cloud, write_classified
@@ -227,8 +227,7 @@ def follow(
     VinemapError
         If the input can't be used or the product can't be written.
     """
-    parcel, cloud, settings, origin = recipe.parcel, recipe.cloud, recipe.settings, recipe.origin
-    with_pdal = settings.ground.engine == "pdal"
+    parcel, settings, origin = recipe.parcel, recipe.settings, recipe.origin
     check_engine(settings.ground.engine)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
@@ -240,21 +239,7 @@ def follow(
         return out
 
     with store.product(folder, drafts=drafts, within=within) as draft:
-        collector = Collector(
-            paths.tiles(draft),
-            most=settings.reading.max_points or _most_points(),
-            block=block_side(settings.ground.resolution),
-        )
-        points: Cloud
-        if piece:
-            points = run("Reading", read_piece, piece, collector)
-        else:
-            how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
-            if with_pdal:
-                points = run("Reading", read_cloud_pdal, cloud, **how)
-            else:
-                points = run("Reading", read_cloud, cloud, collector=collector, **how)
-            recipe.sources[0].check()
+        points = _read(recipe, piece, draft, run)
         if origin and np.abs(to_main(points.extent[0][None], points.crs, origin)[0, :2]).max() > FARTHEST:
             raise InputError(
                 f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
@@ -288,54 +273,98 @@ def follow(
 
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        counts = {"points": points.size, "key_points_found": seen.n_key_points}
-        counts |= {name: len(layer) for name, layer in layers.items()}
-        modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
-        length = round(float(rows["length_m"].sum()), 3)
-        record: dict[str, Any] = {
-            "vinemap": __version__,
-            "key": recipe.key,
-            "survey": recipe.survey,
-            "parcel": parcel,
-            "flown": recipe.flown.isoformat(),
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "inputs": [source.record() for source in recipe.sources],
-            "settings": settings.model_dump(mode="json"),
-            "crs": points.crs.to_string(),
-            "vertical_datum": points.vertical,
-            "origin": origin._asdict(),
-            "counts": counts,
-            "length_m": length,
-            "modelling": modelling.to_dict() if len(model.table) else None,
-            "warnings": notices(rows, seen.chm, layers["parcel"], points.size),
-            "versions": {"python": platform.python_version()}
-            | {name: version(name) for name in LIBRARIES}
-            | (pdal_versions() if with_pdal else {}),
-        }
-        page = parcel_page(record, layers, seen.dtm, seen.chm, paths.canopy_mesh(draft, parcel).read_bytes())
-        paths.report(draft, parcel).write_text(page, encoding="utf-8")
-        item = parcel_item(
-            draft,
-            parcel,
-            flown=recipe.flown,
-            polygon=layers["parcel"].union_all(),
-            crs=points.crs,
-            properties={
-                "version": __version__,
-                "points": points.size,
-                "rows": len(rows),
-                "rows_length_m": length,
-                "area_m2": round(float(layers["parcel"].area.sum()), 1),
-            },
-            survey=recipe.survey,
-        )
-        save(item, paths.stac_item(draft, parcel))
+        record = _record(recipe, points, seen, model, layers, origin)
+        record["warnings"] += _write_page(draft, record, layers, seen)
+        _write_item(draft, recipe, record, layers["parcel"], points.crs)
         record |= {
+            "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
             "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    return Summary(parcel, folder, len(rows), length, time.perf_counter() - began, tuple(record["warnings"]))
+    return Summary(
+        parcel, folder, len(rows), record["length_m"], time.perf_counter() - began, tuple(record["warnings"])
+    )
+
+
+def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:
+    """The points that a recipe asks for, in memory or in tiles beside the draft."""
+    settings = recipe.settings
+    collector = Collector(
+        paths.tiles(draft),
+        most=settings.reading.max_points or _most_points(),
+        block=block_side(settings.ground.resolution),
+    )
+    points: Cloud
+    if piece:
+        points = run("Reading", read_piece, piece, collector)
+        return points
+    how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
+    if settings.ground.engine == "pdal":
+        points = run("Reading", read_cloud_pdal, recipe.cloud, **how)
+    else:
+        points = run("Reading", read_cloud, recipe.cloud, collector=collector, **how)
+    recipe.sources[0].check()
+    return points
+
+
+def _record(
+    recipe: Recipe,
+    points: Cloud,
+    seen: RowMap,
+    model: CanopyModel,
+    layers: dict[str, gpd.GeoDataFrame],
+    origin: Origin,
+) -> dict[str, Any]:
+    """What ``run.json`` tells, but for times and files."""
+    modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+    versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+    return {
+        "vinemap": __version__,
+        "key": recipe.key,
+        "survey": recipe.survey,
+        "parcel": recipe.parcel,
+        "flown": recipe.flown.isoformat(),
+        "inputs": [source.record() for source in recipe.sources],
+        "settings": recipe.settings.model_dump(mode="json"),
+        "crs": points.crs.to_string(),
+        "vertical_datum": points.vertical,
+        "origin": origin._asdict(),
+        "counts": {"points": points.size, "key_points_found": seen.n_key_points}
+        | {name: len(layer) for name, layer in layers.items()},
+        "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
+        "modelling": modelling.to_dict() if len(model.table) else None,
+        "warnings": notices(layers["rows"], seen.chm, layers["parcel"], points.size),
+        "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
+    }
+
+
+def _write_item(folder: Path, recipe: Recipe, record: dict[str, Any], polygons: gpd.GeoDataFrame, crs: CRS) -> None:
+    """Write a product's STAC item, which lists the files that are there."""
+    properties = {
+        "version": __version__,
+        "points": record["counts"]["points"],
+        "rows": record["counts"]["rows"],
+        "rows_length_m": record["length_m"],
+        "area_m2": round(float(polygons.area.sum()), 1),
+    }
+    where: dict[str, Any] = {"polygon": polygons.union_all(), "crs": crs, "survey": recipe.survey}
+    item = parcel_item(folder, recipe.parcel, flown=recipe.flown, properties=properties, **where)
+    save(item, paths.stac_item(folder, recipe.parcel))
+
+
+def _write_page(folder: Path, record: dict[str, Any], layers: dict[str, gpd.GeoDataFrame], seen: RowMap) -> list[str]:
+    """Write a product's page, or tell why there is none: a fault of our own in a page costs no product."""
+    parcel = record["parcel"]
+    canopies = paths.canopy_mesh(folder, parcel).read_bytes()
+    try:
+        page = parcel_page(record, layers, seen.dtm, seen.chm, canopies)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - as said
+        return [f"it has no page: {own_fault(error)}"]
+    paths.report(folder, parcel).write_text(page, encoding="utf-8")
+    return []
 
 
 class CanopyModel(NamedTuple):

@@ -48,6 +48,7 @@ def workshop(folder: Path) -> Iterator[Path]:
     OutputError
         If nothing can be written there.
     """
+    _check_path(Path(os.path.realpath(folder)))
     made = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -91,6 +92,7 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
     place = Path(os.path.realpath(target))
     if within and place != within.resolve() / target.name:
         raise OutputError(f"{target}: is a link to {place}: put a folder in its place")
+    _check_path(place)
     made = [folder for folder in place.parents if not folder.exists()]
     draft = (drafts or place.parent) / f".{place.name}.{uuid.uuid4().hex[:8]}.part"
     try:
@@ -110,6 +112,12 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         raise unwritable(target, error) from error
     finally:
         _remove_empty(made)
+
+
+def _check_path(place: Path) -> None:
+    """Refuse a path that pyogrio would cut at its "!", as that of an archive (its issue 632), and write elsewhere."""
+    if "!" in str(place):
+        raise OutputError(f"{place}: has a '!' in its path, which stands for an archive: choose another folder")
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextvars
 import json
 import time
+import warnings
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from datetime import UTC, datetime
 from functools import partial
@@ -102,7 +103,7 @@ def map_survey(
                 given = [(source.path, source.record()) for source in plan.sources]
                 products = write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
                 _write_tileset(paths.tileset(folder), products)
-                write_index(folder, config.survey)
+                _write_page(folder, config.survey)
 
 
 def _write_tileset(path: Path, products: Sequence[Path]) -> None:
@@ -111,6 +112,16 @@ def _write_tileset(path: Path, products: Sequence[Path]) -> None:
         write_whole(path, json.dumps(tileset))
     else:
         path.unlink(missing_ok=True)
+
+
+def _write_page(folder: Path, survey: str) -> None:
+    """Write the survey's page; a fault of our own in it neither fails a job nor hides why one failed."""
+    try:
+        write_index(folder, survey)
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001 - as said
+        warnings.warn(f"{paths.index(folder)} can't be written: {own_fault(error)}", RuntimeWarning, stacklevel=2)
 
 
 def _noted(outcomes: Iterator[Outcome] | list[Outcome], into: list[Outcome]) -> Iterator[Outcome]:

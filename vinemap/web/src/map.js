@@ -59,6 +59,7 @@ export function showMap(rows, profiles, selected) {
     hit.bindTooltip(() => hint(row), { sticky: true, className: "about", opacity: 1 });
     hit.on("click", () => selected.set(row)).addTo(map);
     hit.getElement().dataset.row = row.row_id;
+    hit.getElement().setAttribute("tabindex", "-1"); // keys choose rows in the list and the table
   }
   const numbers = rows.map((row) => new Marker(place(row.line.points[0]), {
     pane: "numbers", interactive: false, keyboard: false, alt: "",
