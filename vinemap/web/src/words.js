@@ -32,9 +32,9 @@ export function showQuality({ modelling, totals, counts }, rows) {
   facts(at("quality"), [
     ["Confidence in rows", number(totals.confidence, 2), "", rows.length ? (doubtful ? `${doubtful} below 0.5` : `lowest ${number(Math.min(...rows.map((row) => row.confidence)), 2)}`) : ""],
     ["Rows with canopy", percent(totals.support), "%", "of their length"],
-    ["Well modelled", percent(modelling?.good), "%", "of the foliage’s cross-section"],
-    ["Under-modelled", percent(modelling?.under), "%", "foliage left out"],
-    ["Over-modelled", percent(modelling?.over), "%", "added around it"],
+    ["Well modelled", percent(modelling?.good), "%", "of the outline of the points"],
+    ["Under-modelled", percent(modelling?.under), "%", "of that outline left out"],
+    ["Over-modelled", percent(modelling?.over), "%", "added around that outline"],
     ["Complexity reduction", number(modelling?.reduction, 3), "", "after Table 3.1"],
     ["Quality score", number(modelling?.quality, 3), "", "1 is best"],
     ["Points", number((counts?.points ?? NaN) / 1e6, 2), "million", `${plural(counts?.sections ?? 0, "canopy section")}`],
