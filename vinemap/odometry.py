@@ -39,6 +39,8 @@ APART = 6
 """Pixels between two places that aren't the same."""
 BACKGROUND = 4.0
 """Sigma in pixels of the coarse frames of what is taken off as uneven light."""
+TURNED = 1.2
+"""Room that a square needs to turn by 9°, as a share of its half width."""
 LEAST_CONTRAST = 1.0
 """Standard deviation in grey levels below which a frame shows nothing."""
 LEAST_OVERLAP = 0.1
@@ -238,7 +240,7 @@ def _detail(image: Array) -> Array:
 
 def _pair(a: Array, b: Array, half: int, step: float, angles: tuple[float, float]) -> _Pair:
     height, width = a.shape
-    turns = range(int(np.floor(angles[0] / step)), int(np.ceil(angles[1] / step)) + 1)
+    turns = range(int(np.floor(angles[0] / step)) - 1, int(np.ceil(angles[1] / step)) + 2)
     whole = turns, range(half, height - half), range(half, width - half)
     return _Pair(a, b, (height // 2, width // 2), half, step, whole)
 
@@ -264,7 +266,7 @@ def _correlation(pair: _Pair, box: Box) -> Array:
     out = np.empty((len(turns), len(rows), len(columns)), np.float32)
     for turn, plane in zip(turns, out, strict=True):
         matrix = _warp(turn * pair.step, pair.centre, (half, half))
-        template = cv2.warpAffine(pair.a, matrix, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        template = cv2.warpAffine(pair.a, matrix, (size, size), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
         plane[:] = cv2.matchTemplate(part, template, cv2.TM_CCOEFF_NORMED)
     return out
 
@@ -336,15 +338,21 @@ def _refined(pair: _Pair, top: Index, method: Method) -> _Place:
 
 
 def _aligned(pair: _Pair, place: _Place) -> _Place:
-    """The place at which the enhanced correlation coefficient is highest, near one; that one where there is none."""
+    """The place at which the enhanced correlation coefficient is highest, near one; that one where there is none.
+
+    What is aligned is twice as wide as the template where both frames show so much.
+    """
     import cv2
 
-    half, (row, column) = pair.half, pair.centre
+    height, width = pair.b.shape
+    room = min(place.row, place.column, height - 1 - place.row, width - 1 - place.column)
+    half = max(pair.half, min(2 * pair.half, int(room / TURNED)))
+    far, (row, column) = int(np.ceil(half * TURNED)) + 2, pair.centre
     template = pair.a[row - half : row + half + 1, column - half : column + half + 1]
-    top, left = (max(0, int(value) - 2 * half) for value in place[1:])
-    part = pair.b[top : top + 4 * half + 1, left : left + 4 * half + 1]
+    top, left = (max(0, round(value) - far) for value in place[1:])
+    part = pair.b[top : round(place.row) + far + 1, left : round(place.column) + far + 1]
     matrix = _warp(-place.angle, (place.row - top, place.column - left), (half, half)).astype(np.float32)
-    enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-6)
+    enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
     try:
         _, matrix = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, None, 1)
     except cv2.error:  # it doesn't converge

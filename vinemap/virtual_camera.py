@@ -59,6 +59,9 @@ class Weather(NamedTuple):
     """Sigma in pixels."""
 
 
+WEATHER = Weather()
+
+
 def lay_ground(name: str, *, size_mm: tuple[float, float], seed: int = 0) -> Ground:
     """Ground of one of the names of :data:`PHOTOGRAPHS` and :data:`MADE`, wide and high as told.
 
@@ -84,7 +87,7 @@ def rough(ground: Ground, *, amplitude_mm: float, correlation_mm: float, seed: i
     return ground._replace(relief=whole - whole.mean())
 
 
-def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather = Weather(), seed: int = 0) -> Image:
+def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather = WEATHER, seed: int = 0) -> Image:
     """What a robot's camera sees.
 
     Raises
@@ -111,7 +114,7 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     values = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     if weather.blur:
         values = cv2.GaussianBlur(values, (0, 0), weather.blur)
-    away = rng.uniform(0, 2 * np.pi)
+    away = np.radians(25.0)  # the lamps ride with the camera
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
     values *= 1 + weather.light * (x * np.cos(away) + y * np.sin(away)) / np.sqrt(2)
     values += rng.normal(0, weather.noise, values.shape)
@@ -144,6 +147,26 @@ def straight(*, length_mm: float = 9600.0, step_mm: float = 61.0, heading_deg: f
     a = np.radians(heading_deg)
     steps = np.arange(0, length_mm, step_mm)
     return [Pose(float(s * np.cos(a)), float(s * np.sin(a)), heading_deg) for s in steps]
+
+
+def wander(
+    n: int, *, step_mm: float = 70.0, turn_deg: float = 9.0, room_mm: float = 250.0, camera: Camera = LOW, seed: int = 0
+) -> list[Pose]:
+    """Poses of a robot whose camera moves at random by up to a step and turns, and stays about the origin."""
+    rng = np.random.default_rng(seed)
+    place, heading, poses = np.zeros(2), 0.0, []
+    while len(poses) < n:
+        a = np.radians(heading)
+        poses.append(
+            Pose(float(place[0] - camera.x_mm * np.cos(a)), float(place[1] - camera.x_mm * np.sin(a)), heading)
+        )
+        heading += rng.uniform(-turn_deg, turn_deg)
+        step = np.full(2, np.inf)
+        while np.abs(place + step).max() > room_mm:
+            away = rng.uniform(0, 2 * np.pi)
+            step = step_mm * np.sqrt(rng.uniform()) * np.array([np.cos(away), np.sin(away)])
+        place = place + step
+    return poses
 
 
 def _seen(ground: Ground, pose: Pose, camera: Camera, rays: list[Array], height: Array) -> tuple[Array, Array]:
@@ -201,13 +224,13 @@ def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Ar
 
 
 def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-    """Ground of noise at several scales, given in mm."""
-    scales = {
-        "soil": ((1.0, 12), (3.0, 16), (12.0, 14)),
-        "asphalt": ((0.8, 18), (2.0, 14)),
-        "concrete": ((0.8, 3), (4.0, 3), (25.0, 4)),
+    """Ground of noise: each layer's size of grain in mm, contrast in grey levels, and how sharp its edges are."""
+    layers = {
+        "soil": ((0.5, 9, 1), (1.5, 12, 3), (4.0, 12, 2), (12.0, 8, 1)),
+        "asphalt": ((0.4, 6, 1), (0.8, 10, 4), (2.0, 16, 4)),
+        "concrete": ((0.4, 3, 1), (0.7, 5, 2), (4.0, 3, 1), (25.0, 4, 1)),
     }[name]
-    values = sum(level * _noise(shape, scale / RESOLUTION, rng) for scale, level in scales)
-    if name == "soil":  # clods with dark cracks between
-        values = values - 25 * np.clip(_noise(shape, 4.0 / RESOLUTION, rng) - 1, 0, 1.5)
-    return np.asarray(125 + values)
+    values = np.full(shape, 125.0, np.float32)
+    for grain, contrast, edge in layers:
+        values += contrast * np.tanh(edge * _noise(shape, grain / RESOLUTION, rng)) / np.tanh(edge)
+    return values
