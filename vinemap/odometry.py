@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Box = tuple[range, range, range]
     Index = tuple[int, int, int]
 
-Method = Literal["quadratic", "centroid", "maximum"]
+Method = Literal["aligned", "quadratic", "centroid", "maximum"]
 Search = Literal["coarse to fine", "exhaustive"]
 
 ANGLE_STEP = 1.15
@@ -116,6 +116,8 @@ class _Pair(NamedTuple):
     """Its half width w_T."""
     step: float
     """Degrees between angles."""
+    cubic: bool
+    """Whether the template is turned by cubic instead of linear interpolation."""
     whole: Box
     """All angles, in steps, rows and columns of the search."""
 
@@ -127,9 +129,8 @@ def estimate_motion(
     camera: Camera,
     template_share: float = 0.2,
     angles: tuple[float, float] = (-9.0, 9.0),
-    method: Method = "quadratic",
+    method: Method = "aligned",
     search: Search = "coarse to fine",
-    align: bool = False,
 ) -> Motion:
     """Estimate how a robot moved between two frames.
 
@@ -141,13 +142,12 @@ def estimate_motion(
         p_T, width of the template as a share of the image's shorter side, above 0 and below 1.
     angles : (float, float)
         Smallest and largest turn of the robot in degrees.
-    method : {"quadratic", "centroid", "maximum"}
-        How the peak of the correlation is refined: by a quadratic through its 27 neighbours, by the thesis's weighted
-        centroid (Eq. 9–12), or not at all, which with frames as they are is the standard algorithm.
+    method : {"aligned", "quadratic", "centroid", "maximum"}
+        How the peak of the correlation is refined: by a quadratic through its 27 neighbours, from which on frames are
+        aligned by the enhanced correlation coefficient, or by the quadratic alone; by the thesis's weighted centroid
+        (Eq. 9–12); or not at all, on frames as they are: the standard algorithm.
     search : {"coarse to fine", "exhaustive"}
         Whether all places and angles are tried at a quarter of the resolution first, or at the full one.
-    align : bool
-        Align the template once more by the enhanced correlation coefficient.
 
     Raises
     ------
@@ -163,8 +163,9 @@ def estimate_motion(
     for image in (frame, next_frame):
         _check(image, camera)
     half = max(2, round(template_share * min(frame.shape) / 2))
-    sigma = 0.0 if method == "maximum" else SMOOTHING
-    pair = _pair(_smoothed(frame, sigma), _smoothed(next_frame, sigma), half, ANGLE_STEP, angles)
+    standard = method == "maximum"
+    a, b = (_smoothed(image, 0.0 if standard else SMOOTHING) for image in (frame, next_frame))
+    pair = _pair(a, b, half, ANGLE_STEP, angles, cubic=not standard)
     if min(frame.std(), next_frame.std()) < LEAST_CONTRAST:
         return _motion(camera, pair, _Place(0.0, *pair.centre), flag="blank")
     coarse = _reduced(frame), _reduced(next_frame)
@@ -174,8 +175,6 @@ def estimate_motion(
         peaks.append(_peak(pair, pair.whole))
     top, score = max(peaks, key=lambda peak: peak[1])
     place = _refined(pair, top, method)
-    if align:
-        place = _aligned(pair, place)
     agreement, overlap = _agreement(*details, pair.centre, place)
     others = {other for other, _ in peaks if np.hypot(other[1] - top[1], other[2] - top[2]) > APART}
     rival = max((_agreement(*details, pair.centre, _at(pair, other))[0] for other in others), default=0.0)
@@ -238,11 +237,11 @@ def _detail(image: Array) -> Array:
     return image - cv2.GaussianBlur(image, (0, 0), BACKGROUND)
 
 
-def _pair(a: Array, b: Array, half: int, step: float, angles: tuple[float, float]) -> _Pair:
+def _pair(a: Array, b: Array, half: int, step: float, angles: tuple[float, float], *, cubic: bool = False) -> _Pair:
     height, width = a.shape
     turns = range(int(np.floor(angles[0] / step)) - 1, int(np.ceil(angles[1] / step)) + 2)
     whole = turns, range(half, height - half), range(half, width - half)
-    return _Pair(a, b, (height // 2, width // 2), half, step, whole)
+    return _Pair(a, b, (height // 2, width // 2), half, step, cubic, whole)
 
 
 def _at(pair: _Pair, index: Sequence[float]) -> _Place:
@@ -262,11 +261,12 @@ def _correlation(pair: _Pair, box: Box) -> Array:
 
     turns, rows, columns = box
     half, size = pair.half, 2 * pair.half + 1
+    flags = (cv2.INTER_CUBIC if pair.cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
     part = pair.b[rows[0] - half : rows[-1] + half + 1, columns[0] - half : columns[-1] + half + 1]
     out = np.empty((len(turns), len(rows), len(columns)), np.float32)
     for turn, plane in zip(turns, out, strict=True):
         matrix = _warp(turn * pair.step, pair.centre, (half, half))
-        template = cv2.warpAffine(pair.a, matrix, (size, size), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+        template = cv2.warpAffine(pair.a, matrix, (size, size), flags=flags)
         plane[:] = cv2.matchTemplate(part, template, cv2.TM_CCOEFF_NORMED)
     return out
 
@@ -320,21 +320,41 @@ def _climb(pair: _Pair, start: _Place) -> tuple[Index, float]:
 
 def _refined(pair: _Pair, top: Index, method: Method) -> _Place:
     """The peak between the steps of the search."""
-    if method == "maximum":
-        return _at(pair, top)
-    reach = 1 if method == "quadratic" else NEIGHBOURS
+    match method:
+        case "maximum":
+            return _at(pair, top)
+        case "centroid":
+            return _centroid(pair, top)
+        case "quadratic":
+            return _vertex(pair, top)
+        case "aligned":
+            return _aligned(pair, _vertex(pair, top))
+
+
+def _near(pair: _Pair, top: Index, reach: int) -> tuple[Array, Array]:
+    """Steps from a peak (n, 3), and the correlations there."""
     box = _around(pair, top, (reach, reach, reach))
-    values = _correlation(pair, box)
-    places = np.stack(np.meshgrid(*box, indexing="ij"), axis=-1) - top
-    if method == "centroid":
-        near = (np.linalg.norm(places, axis=-1) <= NEIGHBOURS) & (values >= SHARE_OF_PEAK * values.max())
-        return _at(pair, top + np.average(places[near], axis=0, weights=values[near]))
-    k, i, j = places.reshape(-1, 3).T.astype(float)
+    steps = np.stack(np.meshgrid(*box, indexing="ij"), axis=-1) - top
+    return steps.reshape(-1, 3), _correlation(pair, box).ravel()
+
+
+def _centroid(pair: _Pair, top: Index) -> _Place:
+    """Weighted centroid of Γ (Eq. 9–12)."""
+    steps, values = _near(pair, top, NEIGHBOURS)
+    chosen = (np.linalg.norm(steps, axis=1) <= NEIGHBOURS) & (values >= SHARE_OF_PEAK * values.max())
+    return _at(pair, top + np.average(steps[chosen], axis=0, weights=values[chosen]))
+
+
+def _vertex(pair: _Pair, top: Index) -> _Place:
+    """Highest point of the quadratic that fits a peak's neighbours best."""
+    steps, values = _near(pair, top, 1)
+    k, i, j = steps.T.astype(float)
     terms = np.column_stack([np.ones_like(k), k, i, j, k * k, i * i, j * j, k * i, k * j, i * j])
-    _, *slope, kk, ii, jj, ki, kj, ij = np.linalg.lstsq(terms, values.ravel().astype(float))[0]
+    _, *slope, kk, ii, jj, ki, kj, ij = np.linalg.lstsq(terms, values.astype(float))[0]
     bend = np.array([[2 * kk, ki, kj], [ki, 2 * ii, ij], [kj, ij, 2 * jj]])
-    is_peak = np.all(np.linalg.eigvalsh(bend) < 0)
-    return _at(pair, top - np.clip(np.linalg.solve(bend, slope), -1, 1) if is_peak else top)
+    if np.any(np.linalg.eigvalsh(bend) >= 0):
+        return _at(pair, top)
+    return _at(pair, top - np.clip(np.linalg.solve(bend, slope), -1, 1))
 
 
 def _aligned(pair: _Pair, place: _Place) -> _Place:
