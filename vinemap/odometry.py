@@ -244,11 +244,11 @@ def _pair(a: Array, b: Array, half: int, step: float, angles: tuple[float, float
     return _Pair(a, b, (height // 2, width // 2), half, step, cubic, whole)
 
 
-def _at(pair: _Pair, index: Sequence[float]) -> _Place:
+def _at(pair: _Pair, index: Sequence[float] | Array) -> _Place:
     return _Place(float(index[0] * pair.step), float(index[1]), float(index[2]))
 
 
-def _warp(angle: float, source: Sequence[float], target: Sequence[float]) -> Array:
+def _warp(angle: float, source: Sequence[float] | Array, target: Sequence[float] | Array) -> Array:
     """Matrix (2, 3) to pixels of a frame from those of the next, (row, column) of a point in both given."""
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     turn = np.array([[c, s], [-s, c]])
@@ -372,9 +372,10 @@ def _aligned(pair: _Pair, place: _Place) -> _Place:
     top, left = (max(0, round(value) - far) for value in place[1:])
     part = pair.b[top : round(place.row) + far + 1, left : round(place.column) + far + 1]
     matrix = _warp(-place.angle, (place.row - top, place.column - left), (half, half)).astype(np.float32)
+    whole = np.full(part.shape, 255, np.uint8)
     enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
     try:
-        _, matrix = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, None, 1)
+        _, matrix = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, whole, 1)
     except cv2.error:  # it doesn't converge
         return place
     x, y = matrix @ (half, half, 1)

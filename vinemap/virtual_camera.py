@@ -101,7 +101,7 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     n = SUPERSAMPLING.get(camera, 1)
     right = (np.arange(camera.width * n) + 0.5) / n - camera.width / 2
     down = (np.arange(camera.height * n) + 0.5) / n - camera.height / 2
-    rays = np.meshgrid(right / camera.fx, -down / camera.fy)
+    rays: tuple[Array, Array] = np.meshgrid(right / camera.fx, -down / camera.fy)
     columns, rows = _seen(ground, pose, camera, rays, np.zeros((1, 1)))
     ny, nx = ground.image.shape
     if min(columns.min(), rows.min()) < 1 or columns.max() > nx - 2 or rows.max() > ny - 2:
@@ -109,16 +109,16 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     if ground.relief is not None:
         for _ in range(4):  # where rays meet the surface
             height = cv2.remap(ground.relief, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            columns, rows = _seen(ground, pose, camera, rays, height)
+            columns, rows = _seen(ground, pose, camera, rays, height.astype(np.float32))
     fine = cv2.remap(ground.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     values = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     if weather.blur:
         values = cv2.GaussianBlur(values, (0, 0), weather.blur)
     away = np.radians(25.0)  # the lamps ride with the camera
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
-    values *= 1 + weather.light * (x * np.cos(away) + y * np.sin(away)) / np.sqrt(2)
-    values += rng.normal(0, weather.noise, values.shape)
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    light = 1 + weather.light * (x * np.cos(away) + y * np.sin(away)) / np.sqrt(2)
+    noisy = values * light + rng.normal(0, weather.noise, values.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
 
 def moved(pose: Pose, next_pose: Pose) -> tuple[float, float, float]:
@@ -154,7 +154,8 @@ def wander(
 ) -> list[Pose]:
     """Poses of a robot whose camera moves at random by up to a step and turns, and stays about the origin."""
     rng = np.random.default_rng(seed)
-    place, heading, poses = np.zeros(2), 0.0, []
+    poses: list[Pose] = []
+    place, heading = np.zeros(2), 0.0
     while len(poses) < n:
         a = np.radians(heading)
         poses.append(
@@ -169,7 +170,7 @@ def wander(
     return poses
 
 
-def _seen(ground: Ground, pose: Pose, camera: Camera, rays: list[Array], height: Array) -> tuple[Array, Array]:
+def _seen(ground: Ground, pose: Pose, camera: Camera, rays: tuple[Array, Array], height: Array) -> tuple[Array, Array]:
     """Columns and rows of the ground where rays are at a height."""
     a = np.radians(pose.heading_deg)
     left = camera.above_ground_mm - height
@@ -212,15 +213,17 @@ def _pieces(photograph: Array, shape: tuple[int, int], rng: np.random.Generator)
             total[where] += (weight * (piece - mean))[cut][: room[0], : room[1]]
             squares[where] += (weight * weight)[cut][: room[0], : room[1]]
     inner = np.s_[PIECE : PIECE + shape[0], PIECE : PIECE + shape[1]]
-    return mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
+    out: Array = mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
+    return out
 
 
 def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Array:
     """Gaussian noise of unit variance, smooth."""
     import cv2
 
-    values = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma)
-    return (values - values.mean()) / values.std()
+    values: Array = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma)
+    out: Array = (values - values.mean()) / values.std()
+    return out
 
 
 def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Array:
