@@ -219,7 +219,7 @@ def _smoothed(image: Image, sigma: float) -> Array:
     import cv2
 
     values = image.astype(np.float32)
-    return cv2.GaussianBlur(values, (0, 0), sigma) if sigma else values
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32) if sigma else values
 
 
 def _reduced(image: Image) -> Array:
@@ -228,7 +228,7 @@ def _reduced(image: Image) -> Array:
 
     height, width = (size // COARSE for size in image.shape)
     whole = image[: height * COARSE, : width * COARSE].astype(np.float32)
-    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _detail(image: Array) -> Array:
@@ -375,12 +375,13 @@ def _aligned(pair: _Pair, place: _Place) -> _Place:
     whole = np.full(part.shape, 255, np.uint8)
     enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
     try:
-        _, matrix = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, whole, 1)
+        _, found = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, whole, 1)
     except cv2.error:  # it doesn't converge
         return place
+    matrix = np.asarray(found)
     x, y = matrix @ (half, half, 1)
-    found = _Place(float(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))), float(y) + top, float(x) + left)
-    return found if np.hypot(found.row - place.row, found.column - place.column) < 1 else place
+    near = _Place(float(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))), float(y) + top, float(x) + left)
+    return near if np.hypot(near.row - place.row, near.column - place.column) < 1 else place
 
 
 def _agreement(a: Array, b: Array, centre: Sequence[float], place: _Place) -> tuple[float, float]:

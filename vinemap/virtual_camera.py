@@ -118,7 +118,8 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
     light = 1 + weather.light * (x * np.cos(away) + y * np.sin(away)) / np.sqrt(2)
     noisy = values * light + rng.normal(0, weather.noise, values.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    out: Image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return out
 
 
 def moved(pose: Pose, next_pose: Pose) -> tuple[float, float, float]:
@@ -221,7 +222,7 @@ def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Ar
     """Gaussian noise of unit variance, smooth."""
     import cv2
 
-    values: Array = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma)
+    values = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma))
     out: Array = (values - values.mean()) / values.std()
     return out
 
