@@ -85,7 +85,7 @@ class Motion(NamedTuple):
     score: float
     """Normalised cross-correlation of the template at its best place, up to 1."""
     agreement: float
-    """Correlation of all that both frames show, so moved."""
+    """Correlation of all that both frames show, so moved; of a few peaks that with the highest is chosen."""
     rival: float
     """The same for the next best place."""
     overlap: float
@@ -173,11 +173,12 @@ def estimate_motion(
     peaks = [_climb(pair, place) for place in _candidates(*coarse, half, angles)]
     if search == "exhaustive":
         peaks.append(_peak(pair, pair.whole))
-    top, score = max(peaks, key=lambda peak: peak[1])
+    agreed = {index: _agreement(*details, pair.centre, _at(pair, index))[0] for index, _ in peaks}
+    top, score = max(peaks, key=lambda peak: agreed[peak[0]])
+    others = [index for index in agreed if np.hypot(index[1] - top[1], index[2] - top[2]) > APART]
+    rival = max((agreed[index] for index in others), default=0.0)
     place = _refined(pair, top, method)
     agreement, overlap = _agreement(*details, pair.centre, place)
-    others = {other for other, _ in peaks if np.hypot(other[1] - top[1], other[2] - top[2]) > APART}
-    rival = max((_agreement(*details, pair.centre, _at(pair, other))[0] for other in others), default=0.0)
     at_limit, *out = (not within[0] < value < within[-1] for value, within in zip(top, pair.whole, strict=True))
     doubts = {
         "overlap": any(out),
