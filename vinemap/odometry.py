@@ -31,7 +31,7 @@ SMOOTHING = 1.0
 """Sigma in pixels of the Gaussian that both frames get: interpolation blurs the turned template, and only that one."""
 NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95
 """n_Γ and m of Eq. 9."""
-COARSE, COARSE_STEP, CANDIDATES = 4, 3.0, 4
+COARSE, COARSE_STEP, CANDIDATES = 4, 3.0, 8
 """The coarse search: pixels in one of its own, degrees between its angles, and peaks that are looked into."""
 CLIMBS = 8
 """Times that a peak may lie on the edge of where it is looked for before it is left."""
