@@ -17,7 +17,7 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test test-qgis check accuracy bench picture tune web clean
+.PHONY: help parcel survey nightly test test-qgis check accuracy odometry bench picture tune web clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -58,6 +58,9 @@ check: $(READY) ## Check style, format and types
 
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
+
+odometry: $(READY) ## Measure visual odometry on simulated frames
+	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.odometry_accuracy
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
 	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)

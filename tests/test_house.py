@@ -63,6 +63,8 @@ MAY_IMPORT = {
     **dict.fromkeys(STAGES, BASE | DATA),
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
     "scenes": BASE | {"synthetic"},
+    "virtual_camera": {"errors", "odometry"},
+    "odometry_accuracy": {"odometry", "virtual_camera", "tables", "paths"},
     "settings": set(),
     "config": BASE | {"settings", "paths"},
     "template": {"settings", "config"},

@@ -1,0 +1,186 @@
+"""Movement between two frames of known ground, in millimetres and degrees."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from vinemap.errors import InputError
+from vinemap.odometry import Camera, estimate_motion
+from vinemap.virtual_camera import LOW, Ground, Pose, Weather, lay_ground, moved, render, rough, wander
+
+SIZE = (1000, 1000)
+
+
+@pytest.fixture(scope="module")
+def grounds():
+    return {name: lay_ground(name, size_mm=SIZE, seed=4) for name in ("gravel", "soil")}
+
+
+@pytest.fixture(scope="module")
+def walk(grounds):
+    """Pairs of frames on two grounds, each with the true movement."""
+    poses = wander(21, seed=6)
+    out = {}
+    for name, ground in grounds.items():
+        frames = [render(ground, pose, seed=k) for k, pose in enumerate(poses)]
+        out[name] = [(*pair, moved(*step)) for pair, step in zip(pairwise(frames), pairwise(poses), strict=True)]
+    return out
+
+
+def errors(pairs, **options):
+    """Error (n,) of the template's place in mm, and of the turn in degrees."""
+    out = []
+    for frame, next_frame, truth in pairs:
+        motion = estimate_motion(frame, next_frame, camera=LOW, **options)
+        out.append((template_error(motion, truth), abs(motion.rotation_deg - truth[2])))
+    return np.transpose(out)
+
+
+def template_error(motion, truth):
+    a = np.radians(truth[2])
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    was = LOW.ground(LOW.width // 2, LOW.height // 2)
+    return np.hypot(*(LOW.ground(motion.column, motion.row) - turn.T @ (was - truth[:2])))
+
+
+@pytest.mark.parametrize("name", ["gravel", "soil"])
+def test_a_step_is_measured_to_hundredths_of_a_millimetre(walk, name):
+    place, turn = errors(walk[name], method="quadratic")
+    assert np.median(place) < 0.03
+    assert place.max() < 0.12
+    assert turn.mean() < 0.08
+
+
+@pytest.mark.parametrize("name", ["gravel", "soil"])
+def test_alignment_halves_what_is_left(walk, name):
+    place, turn = errors(walk[name], method="quadratic")
+    closer, straighter = errors(walk[name])
+    assert np.median(closer) < 0.6 * np.median(place)
+    assert straighter.mean() < 0.5 * turn.mean()
+
+
+def test_the_enhanced_algorithm_beats_the_standard_one_as_the_thesis_says(walk):
+    pairs = [*walk["gravel"], *walk["soil"]]
+    standard, centroid, quadratic = (errors(pairs, method=m) for m in ("maximum", "centroid", "quadratic"))
+    assert np.median(standard[0]) == pytest.approx(0.33, abs=0.05)  # of pixels of 0.82 mm
+    assert np.median(centroid[0]) < 0.46 * np.median(standard[0])  # Table 4.3: 54% better
+    assert np.mean(centroid[1]) < 0.6 * np.mean(standard[1])
+    assert np.median(quadratic[0]) < 0.15 * np.median(standard[0])
+    assert np.mean(quadratic[1]) < 0.35 * np.mean(standard[1])
+
+
+@pytest.mark.parametrize("method", ["aligned", "quadratic", "centroid", "maximum"])
+def test_coarse_to_fine_finds_what_the_exhaustive_search_finds(walk, method):
+    for frame, next_frame, _ in [*walk["gravel"][::4], *walk["soil"][::4]]:
+        quick, whole = (
+            estimate_motion(frame, next_frame, camera=LOW, method=method, search=search)
+            for search in ("coarse to fine", "exhaustive")
+        )
+        assert (quick.column, quick.row) == pytest.approx((whole.column, whole.row), abs=0.003)
+        assert quick.rotation_deg == pytest.approx(whole.rotation_deg, abs=0.008)
+
+
+def test_steps_on_good_ground_are_believed(walk):
+    motions = [estimate_motion(a, b, camera=LOW) for pairs in walk.values() for a, b, _ in pairs]
+    assert sum(motion.flag != "" for motion in motions) <= 1
+    assert min(motion.agreement for motion in motions) > 0.7
+    assert max(motion.rival for motion in motions) < 0.35
+
+
+@pytest.mark.parametrize(
+    ("right", "down", "movement"), [(10, 0, (-10, 0)), (0, 10, (0, 10)), (-7, 4, (7, 4)), (0, 0, (0, 0))]
+)
+def test_ground_that_moves_back_in_the_image_means_forward(grounds, right, down, movement):
+    frame = render(grounds["gravel"], Pose(-950, 0, 0), weather=Weather(0, 0))
+    shifted = np.roll(frame, (down, right), axis=(0, 1))
+    motion = estimate_motion(frame, shifted, camera=LOW)
+    assert np.array([motion.dx_mm, motion.dy_mm]) == pytest.approx(np.array(movement) * 0.8183, abs=0.05)
+    assert motion.rotation_deg == pytest.approx(0, abs=0.003)
+
+
+@pytest.mark.parametrize("turn", [90, 180])
+def test_a_turned_camera_means_a_turned_robot(grounds, turn):
+    camera = Camera(240, 240, 299.4, 299.4, x_mm=0)
+    frame = render(grounds["gravel"], Pose(0, 0, 0), camera=camera, weather=Weather(0, 0))
+    # A robot that turns to the left sees the ground turn to the right.
+    turned = np.rot90(frame, -turn // 90).copy()
+    motion = estimate_motion(frame, turned, camera=camera, angles=(turn - 9, turn + 9))
+    assert motion.rotation_deg == pytest.approx(turn, abs=0.05)
+    assert (motion.dx_mm, motion.dy_mm) == pytest.approx((0, 0), abs=0.05)
+
+
+def test_the_lever_of_the_camera_counts(grounds):
+    """A robot that turns on the spot moves its camera, not itself."""
+    poses = Pose(-950, 0, 0), Pose(-950, 0, 3)
+    frames = [render(grounds["gravel"], pose, seed=k) for k, pose in enumerate(poses)]
+    motion = estimate_motion(*frames, camera=LOW)
+    assert motion.rotation_deg == pytest.approx(3, abs=0.02)
+    assert np.hypot(motion.dx_mm, motion.dy_mm) < 0.4
+    assert LOW.ground(motion.column, motion.row)[1] == pytest.approx(-950 * np.sin(np.radians(3)), abs=0.5)
+
+
+def test_relief_of_grass_costs_less_than_a_tenth_of_a_millimetre():
+    ground = rough(lay_ground("grass", size_mm=SIZE, seed=2), amplitude_mm=8, correlation_mm=30, seed=2)
+    poses = wander(25, seed=2)
+    frames = [render(ground, pose, seed=k) for k, pose in enumerate(poses)]
+    pairs = [(*pair, moved(*step)) for pair, step in zip(pairwise(frames), pairwise(poses), strict=True)]
+    place, turn = errors(pairs)
+    assert np.median(place) < 0.08
+    assert turn.mean() < 0.15
+
+
+def flags(frames):
+    return [estimate_motion(*pair, camera=LOW).flag for pair in frames]
+
+
+def test_frames_of_other_places_are_never_believed(grounds):
+    far = [Pose(x - 950, y, 0) for x in (-300, 0, 300) for y in (-330, -110, 110, 330)]
+    for ground in grounds.values():
+        frames = [render(ground, pose, seed=k) for k, pose in enumerate(far)]
+        assert all(flags((a, b) for a in frames[:5] for b in frames[6:]))
+
+
+@pytest.mark.parametrize("far", [125, 140, 160, 180])
+def test_a_step_beyond_the_overlap_is_flagged(grounds, far):
+    frames = [render(grounds["gravel"], Pose(x - 950, 0, 0)) for x in (0, far)]
+    assert flags([frames]) != [""]
+
+
+def test_a_turn_beyond_the_angles_is_flagged(grounds):
+    frames = [render(grounds["soil"], Pose(-950, 0, heading)) for heading in (0, 12)]
+    assert flags([frames]) != [""]
+
+
+def test_blur_is_flagged(grounds):
+    pose = Pose(-950, 0, 0)
+    frames = [render(grounds["gravel"], pose, weather=Weather(blur=blur)) for blur in (0, 4)]
+    assert flags([frames, frames[::-1]]) == ["blur", "blur"]
+
+
+def test_ground_that_repeats_is_flagged(grounds):
+    tile = np.tile(grounds["gravel"].image[:100, :100], (25, 25))  # every 40 mm
+    frames = [render(Ground(tile), Pose(x - 950, 0, 0), seed=k) for k, x in enumerate((0, 12))]
+    assert flags([frames]) == ["repeats"]
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_black_or_white_frame_is_flagged(grounds, level):
+    frame, blank = render(grounds["gravel"], Pose(-950, 0, 0)), np.full((240, 320), level, np.uint8)
+    motion = estimate_motion(frame, blank, camera=LOW)
+    assert (motion.flag, motion.dx_mm, motion.dy_mm, motion.score) == ("blank", 0, 0, 0)
+    assert flags([(blank, frame), (blank, blank)]) == ["blank", "blank"]
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "says"),
+    [
+        ((240, 320, 3), np.uint8, "give grey images"),
+        ((240, 320), np.uint16, "uint16"),
+        ((720, 1280), np.uint8, "1280 × 720 pixels, the camera 320 × 240"),
+    ],
+)
+def test_other_frames_are_refused(shape, kind, says):
+    good = np.zeros((240, 320), np.uint8)
+    with pytest.raises(InputError, match=says):
+        estimate_motion(good, np.zeros(shape, kind), camera=LOW)

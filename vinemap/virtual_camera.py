@@ -1,0 +1,240 @@
+"""Frames of a robot's camera over ground that is known, for measuring odometry: every movement in them is exact."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vinemap.errors import DependencyError
+from vinemap.odometry import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.floating]
+    Image = NDArray[np.uint8]
+
+LOW = Camera()
+HIGH = Camera(1280, 720, 888.8749, 888.5340)
+"""The two cameras of Table 4.1, the size as width × height."""
+PHOTOGRAPHS = ("gravel", "grass", "brick")
+"""Public domain (CC0) photographs of scikit-image, 512 × 512 pixels."""
+MADE = ("soil", "asphalt", "concrete")
+"""Grounds that are made of noise."""
+RESOLUTION = 0.4
+"""Millimetres in a pixel of a ground."""
+SUPERSAMPLING = {LOW: 3, HIGH: 1}
+"""Rays along each side of a pixel."""
+PIECE = 256
+"""Pixels across each piece of a photograph that grounds are laid of."""
+
+
+class Ground(NamedTuple):
+    """A piece of ground about the origin, x to the right and y up."""
+
+    image: Image
+    """Grey levels (ny, nx), :data:`RESOLUTION` mm apart, the first row at the top."""
+    relief: Array | None = None
+    """Height above the plane in mm, of the same shape."""
+
+
+class Pose(NamedTuple):
+    """Where a robot is on the ground."""
+
+    x_mm: float
+    y_mm: float
+    heading_deg: float
+    """Anticlockwise from the x axis."""
+
+
+class Weather(NamedTuple):
+    """What spoils a frame."""
+
+    noise: float = 3.0
+    """Standard deviation in grey levels."""
+    light: float = 0.05
+    """How much brighter and darker than the middle its edges are, as a share, along a direction that changes."""
+    blur: float = 0.0
+    """Sigma in pixels."""
+
+
+WEATHER = Weather()
+
+
+def lay_ground(name: str, *, size_mm: tuple[float, float], seed: int = 0) -> Ground:
+    """Ground of one of the names of :data:`PHOTOGRAPHS` and :data:`MADE`, wide and high as told.
+
+    Photographs are laid as round pieces, each turned and cut at random, so that no place has a copy; where they
+    overlap their contrast is kept (Heitz and Neyret 2018, High-performance by-example noise).
+    """
+    rng = np.random.default_rng(seed)
+    nx, ny = (round(size / RESOLUTION) for size in size_mm)
+    values = _pieces(_photograph(name), (ny, nx), rng) if name in PHOTOGRAPHS else _made(name, (ny, nx), rng)
+    return Ground(np.clip(np.rint(values), 0, 255).astype(np.uint8))
+
+
+def rough(ground: Ground, *, amplitude_mm: float, correlation_mm: float, seed: int = 0) -> Ground:
+    """Ground with hills: from lowest to highest one amplitude, correlated by 1/e at a distance."""
+    rng = np.random.default_rng(seed)
+    coarse = 8
+    shape = tuple(n // coarse + 2 for n in ground.image.shape)
+    hills = _noise(shape, correlation_mm / 2 / RESOLUTION / coarse, rng)
+    hills *= amplitude_mm / np.ptp(hills)
+    import cv2
+
+    whole = cv2.resize(hills, ground.image.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return ground._replace(relief=whole - whole.mean())
+
+
+def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather = WEATHER, seed: int = 0) -> Image:
+    """What a robot's camera sees.
+
+    Raises
+    ------
+    ValueError
+        If it sees beyond the ground.
+    """
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    n = SUPERSAMPLING.get(camera, 1)
+    right = (np.arange(camera.width * n) + 0.5) / n - camera.width / 2
+    down = (np.arange(camera.height * n) + 0.5) / n - camera.height / 2
+    rays: tuple[Array, Array] = np.meshgrid(right / camera.fx, -down / camera.fy)
+    columns, rows = _seen(ground, pose, camera, rays, np.zeros((1, 1)))
+    ny, nx = ground.image.shape
+    if min(columns.min(), rows.min()) < 1 or columns.max() > nx - 2 or rows.max() > ny - 2:
+        raise ValueError(f"The camera sees beyond the ground at {pose}")
+    if ground.relief is not None:
+        for _ in range(4):  # where rays meet the surface
+            height = cv2.remap(ground.relief, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            columns, rows = _seen(ground, pose, camera, rays, height.astype(np.float32))
+    fine = cv2.remap(ground.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    values = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    if weather.blur:
+        values = cv2.GaussianBlur(values, (0, 0), weather.blur)
+    away = np.radians(25.0)  # the lamps ride with the camera
+    x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
+    light = 1 + weather.light * (x * np.cos(away) + y * np.sin(away)) / np.sqrt(2)
+    noisy = values * light + rng.normal(0, weather.noise, values.shape)
+    out: Image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return out
+
+
+def moved(pose: Pose, next_pose: Pose) -> tuple[float, float, float]:
+    """Forward, to the left in mm, and turned in degrees: the next pose in the frame of one."""
+    a = np.radians(pose.heading_deg)
+    x, y = next_pose.x_mm - pose.x_mm, next_pose.y_mm - pose.y_mm
+    turn = (next_pose.heading_deg - pose.heading_deg + 180) % 360 - 180
+    return x * np.cos(a) + y * np.sin(a), y * np.cos(a) - x * np.sin(a), turn
+
+
+def sinusoid(
+    *, length_mm: float = 9600.0, amplitude_mm: float = 150.0, period_mm: float = 3200.0, step_mm: float = 61.0
+) -> list[Pose]:
+    """Poses of a robot that follows a sine from the left to the right, equally far apart along it."""
+    x = np.linspace(0, length_mm, 20001)
+    wave = 2 * np.pi / period_mm
+    y = amplitude_mm * np.sin(wave * x)
+    along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    at = np.interp(np.arange(0, along[-1], step_mm), along, x)
+    headings = np.degrees(np.arctan(amplitude_mm * wave * np.cos(wave * at)))
+    return [Pose(*map(float, pose)) for pose in zip(at, amplitude_mm * np.sin(wave * at), headings, strict=True)]
+
+
+def straight(*, length_mm: float = 9600.0, step_mm: float = 61.0, heading_deg: float = 0.0) -> list[Pose]:
+    """Poses of a robot that drives straight on."""
+    a = np.radians(heading_deg)
+    steps = np.arange(0, length_mm, step_mm)
+    return [Pose(float(s * np.cos(a)), float(s * np.sin(a)), heading_deg) for s in steps]
+
+
+def wander(
+    n: int, *, step_mm: float = 70.0, turn_deg: float = 9.0, room_mm: float = 250.0, camera: Camera = LOW, seed: int = 0
+) -> list[Pose]:
+    """Poses of a robot whose camera moves at random by up to a step and turns, and stays about the origin."""
+    rng = np.random.default_rng(seed)
+    poses: list[Pose] = []
+    place, heading = np.zeros(2), 0.0
+    while len(poses) < n:
+        a = np.radians(heading)
+        poses.append(
+            Pose(float(place[0] - camera.x_mm * np.cos(a)), float(place[1] - camera.x_mm * np.sin(a)), heading)
+        )
+        heading += rng.uniform(-turn_deg, turn_deg)
+        step = np.full(2, np.inf)
+        while np.abs(place + step).max() > room_mm:
+            away = rng.uniform(0, 2 * np.pi)
+            step = step_mm * np.sqrt(rng.uniform()) * np.array([np.cos(away), np.sin(away)])
+        place = place + step
+    return poses
+
+
+def _seen(ground: Ground, pose: Pose, camera: Camera, rays: tuple[Array, Array], height: Array) -> tuple[Array, Array]:
+    """Columns and rows of the ground where rays are at a height."""
+    a = np.radians(pose.heading_deg)
+    left = camera.above_ground_mm - height
+    x, y = camera.x_mm + rays[0] * left, camera.y_mm + rays[1] * left
+    ny, nx = ground.image.shape
+    columns = (pose.x_mm + x * np.cos(a) - y * np.sin(a)) / RESOLUTION + (nx - 1) / 2
+    rows = (ny - 1) / 2 - (pose.y_mm + x * np.sin(a) + y * np.cos(a)) / RESOLUTION
+    return columns.astype(np.float32), rows.astype(np.float32)
+
+
+def _photograph(name: str) -> Array:
+    try:
+        from skimage import data
+    except ImportError as error:
+        raise DependencyError(f"The photograph of {name} comes with scikit-image: pip install scikit-image") from error
+    return getattr(data, name)().astype(np.float32)  # type: ignore[no-any-return]
+
+
+def _pieces(photograph: Array, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    import cv2
+
+    mean, half = photograph.mean(), PIECE // 2
+    total, squares = np.zeros((2, shape[0] + 2 * PIECE, shape[1] + 2 * PIECE), np.float32)
+    away = np.hypot(*np.mgrid[-half:half, -half:half] + 0.5) / half
+    weight = (np.clip(np.cos(np.pi / 2 * np.clip(away, 0, 1)), 0, 1) ** 4).astype(np.float32)
+    reach = np.array(photograph.shape[::-1]) - 2 * half
+    step = half
+    for top in range(0, shape[0] + PIECE, step):
+        for left in range(0, shape[1] + PIECE, step):
+            centre = half + rng.uniform(0, 1, 2) * reach
+            turn = cv2.getRotationMatrix2D(tuple(map(float, centre)), rng.uniform(0, 360), 1.0)
+            turn[:, 2] += half - 0.5 - centre
+            piece = cv2.warpAffine(
+                photograph, turn, (PIECE, PIECE), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+            )
+            i, j = (int(at + rng.integers(-step // 4, step // 4 + 1)) for at in (top, left))
+            where = np.s_[max(i, 0) : i + PIECE, max(j, 0) : j + PIECE]
+            cut = np.s_[max(-i, 0) :, max(-j, 0) :]
+            room = total[where].shape
+            total[where] += (weight * (piece - mean))[cut][: room[0], : room[1]]
+            squares[where] += (weight * weight)[cut][: room[0], : room[1]]
+    inner = np.s_[PIECE : PIECE + shape[0], PIECE : PIECE + shape[1]]
+    out: Array = mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
+    return out
+
+
+def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Array:
+    """Gaussian noise of unit variance, smooth."""
+    import cv2
+
+    values = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma))
+    out: Array = (values - values.mean()) / values.std()
+    return out
+
+
+def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    """Ground of noise: each layer's size of grain in mm, contrast in grey levels, and how sharp its edges are."""
+    layers = {
+        "soil": ((0.5, 9, 1), (1.5, 12, 3), (4.0, 12, 2), (12.0, 8, 1)),
+        "asphalt": ((0.4, 6, 1), (0.8, 10, 4), (2.0, 16, 4)),
+        "concrete": ((0.4, 3, 1), (0.7, 5, 2), (4.0, 3, 1), (25.0, 4, 1)),
+    }[name]
+    values = np.full(shape, 125.0, np.float32)
+    for grain, contrast, edge in layers:
+        values += contrast * np.tanh(edge * _noise(shape, grain / RESOLUTION, rng)) / np.tanh(edge)
+    return values
