@@ -305,11 +305,15 @@ def test_nav2(exported, rows, lanes):
     truth = [shapely.LineString(in_main(shapely.get_coordinates(g, include_z=True), origin)) for g in lanes.geometry]
     assert_same(found, truth)
 
-    headlands = [e for e in edges.values() if e["metadata"] == {"class": "headland"}]
+    headlands = [e for e in edges.values() if e["metadata"]["class"] == "headland"]
     assert {(e["startid"], e["endid"]) for e in headlands if e["startid"] < e["endid"]} == {
         (ends[a][k], ends[a + 1][k]) for a in (0, 1, 3) for k in (0, 1)
     }
     vines = [shapely.LineString(in_main(shapely.get_coordinates(g, include_z=True), origin)) for g in rows.geometry]
+    for edge in headlands:
+        way = shapely.LineString([nodes[edge["startid"]][1:], nodes[edge["endid"]][1:]])
+        assert edge["metadata"]["clear_m"] == pytest.approx(2 * shapely.distance(way, vines).min(), abs=0.02)
+        assert edge["metadata"]["clear_m"] > 4
     for a, b in ways:
         assert not shapely.intersects(vines, shapely.LineString([nodes[a][1:], nodes[b][1:]])).any()
     a, b = np.array(sorted(ways)).T

@@ -88,13 +88,13 @@ def _headlands(
         {*right.split("+"), *left.split("+")} - {""}
         for right, left in zip(lanes["right_rows"], lanes["left_rows"], strict=True)
     ]
-    tree = shapely.STRtree(shapely.force_2d(rows.geometry.to_numpy()))
+    vines = shapely.force_2d(rows.geometry.to_numpy())
     for a, b in itertools.combinations(range(len(lanes)), 2):
         if beside[a] & beside[b]:
             for start, end in ((first[a], first[b]), (first[a + 1] - 1, first[b + 1] - 1)):
                 way = shapely.linestrings(nodes[[start, end]])
-                if len(tree.query(way, predicate="dwithin", distance=NEAR)) == 0:
-                    yield _Edge(start, end, {"class": "headland"})
+                if (near := float(shapely.distance(way, vines).min())) > NEAR:
+                    yield _Edge(start, end, {"class": "headland", "clear_m": round(2 * near, 2)})
 
 
 def _feature(properties: dict[str, Any], kind: str, coordinates: list[Any]) -> dict[str, Any]:
