@@ -144,6 +144,21 @@ def test_a_row_is_selected_everywhere(flights, open_page):
     assert selected(browser) == ["1 A"]
 
 
+def test_a_long_table_scrolls_to_the_selected_row(flights, open_page):
+    browser = open_page(page_of(flights, "A"))
+    browser.execute_script("document.querySelector('#table .scroll').style.maxHeight = '90px'")
+    place = browser.execute_script("return scrollY")
+    for _ in range(4):
+        browser.execute_script("document.getElementById('after').click()")
+    seen = "const r = e => e.getBoundingClientRect(), b = document.querySelector('#table .scroll');"
+    seen += "const l = r(b.querySelector('[aria-current]')), h = r(b.querySelector('thead'));"
+    assert browser.execute_script(seen + "return h.bottom <= l.top + 1 && l.bottom <= r(b).bottom + 1")
+    assert browser.execute_script("return scrollY") == place
+    for _ in range(4):
+        browser.execute_script("document.getElementById('before').click()")
+    assert browser.execute_script(seen + "return h.bottom <= l.top + 1 && l.bottom <= r(b).bottom + 1")
+
+
 def test_keys_get_past_the_map_whatever_number_of_rows_it_has(flights, open_page):
     browser = open_page(page_of(flights, "A"))
     browser.find_element(By.ID, "map").send_keys(Keys.TAB)

@@ -36,13 +36,25 @@ export function rowTable(rows, selected) {
   }));
   const label = { title: "Row", help: "Number of the row, e1 is its western end", values: rows.map((row) => row.row_id), text: true, show: (_, k) => rows[k].label };
   const made = table([label, ...columns], { caption: "Rows in numbers", onselect: (k) => selected.set(rows[k]), sorted: 0 });
+  made.element.classList.add("tall");
   at("table").append(made.element, element("p", { class: "hint" }, "A click on a heading sorts, on a row selects it. e1 is the western end of a row, en the eastern; x, y, z are metres to the east, north and up of the origin of {Main}, lat, lon, alt are WGS 84."));
   return {
     select(row) {
       made.lines.forEach((line, k) => {
-        if (rows[k] === row) line.setAttribute("aria-current", "true");
-        else line.removeAttribute("aria-current");
+        if (rows[k] === row) {
+          line.setAttribute("aria-current", "true");
+          show(made.element, line);
+        } else line.removeAttribute("aria-current");
       });
     },
   };
+}
+
+// Scrolls a box so far that a line in it is seen below the headings; the page itself stays where it is.
+function show(box, line) {
+  const within = box.getBoundingClientRect(), at = line.getBoundingClientRect();
+  const head = box.querySelector("thead").offsetHeight;
+  const above = within.top + head - at.top, below = at.bottom - within.bottom;
+  if (above > 0) box.scrollTop -= above;
+  else if (below > 0) box.scrollTop += below;
 }
