@@ -8,6 +8,7 @@ from pathlib import Path
 import geopandas as gpd
 import pytest
 import shapely
+from systems import POSIX
 
 from vinemap import estate
 from vinemap.config import EstateConfig, load_estate
@@ -15,7 +16,6 @@ from vinemap.errors import InputError
 from vinemap.estate import arrivals
 from vinemap.las import read_cloud
 
-POSIX = pytest.mark.skipif(os.name != "posix", reason="names of files are others here")
 NOW = time.time() + 3600
 """When files that were just written are long settled."""
 

@@ -364,7 +364,8 @@ def test_robots_in_the_grid_and_another_frame_and_without_headland(tmp_path, pro
     how = {"formats": ["nav2", "opennav_coverage"], "frame": "utm", "grid": True, "vertices": 9}
     list(export_products([product / f"{NAME}.gpkg"], tmp_path, **how))
     nodes, _ = graph(tmp_path / NAME / "nav2" / f"{NAME}_graph.geojson")
-    vertices = shapely.get_coordinates(lanes.geometry)
+    vertices = shapely.get_coordinates(lanes_between(rows, vertices=9).geometry)
+    assert len(vertices) == 9 * len(lanes)
     assert np.array([xy for _, *xy in nodes.values()]) == pytest.approx(vertices, abs=0.001)
     assert {frame for frame, *_ in nodes.values()} == {"utm"}
     _, lines = field_of(tmp_path / NAME / "opennav_coverage" / f"{NAME}_2_rows.xml", "utm")

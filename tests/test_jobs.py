@@ -17,6 +17,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from systems import LINUX, POSIX
 
 from vinemap import las, paths, recipe, store, survey
 from vinemap.config import survey_config
@@ -30,8 +31,6 @@ from vinemap.survey import map_survey
 from vinemap.tiles import Collector
 from vinemap.vector import read_parcels
 
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="needs what only Linux has")
-POSIX = pytest.mark.skipif(os.name != "posix", reason="needs links of POSIX")
 PLACE = np.array([414_700.0, 4_940_700.0])
 SIDE = 10.0
 """Metres of a parcel; they stand in a line, the cloud is over all of the first nine."""

@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from systems import POSIX
 
 from vinemap import recipe
 from vinemap.crs import Origin, parse_crs
@@ -18,7 +19,6 @@ from vinemap.errors import BusyError, InputError
 from vinemap.recipe import Source, flown, product_in, read_source, recipe_of
 from vinemap.settings import Settings
 
-POSIX = pytest.mark.skipif(os.name != "posix", reason="times and numbers of files are others here")
 PLACE = np.array([414_700.0, 4_940_700.0])
 
 
@@ -250,7 +250,7 @@ def test_what_is_no_file(tmp_path):
         read_source(tmp_path / ("x" * 300))
 
 
-@pytest.mark.skipif(os.name != "posix", reason="names of files are Unicode here")
+@POSIX
 def test_a_name_that_is_no_unicode_can_be_told(tmp_path):
     """As of a file that was copied from an old disk."""
     path = tmp_path / os.fsdecode(b"Nebbiolo \xe0.las")

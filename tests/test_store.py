@@ -12,13 +12,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from systems import LINUX, POSIX
 
 from vinemap import paths, store
 from vinemap.config import LONGEST_NAME, MOST_BYTES, check_name
 from vinemap.errors import BusyError, OutputError
-
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="needs what only Linux has")
-POSIX = pytest.mark.skipif(os.name != "posix", reason="needs links and signals of POSIX")
 
 
 def fill(folder, text="new", parcel="F", files=("F.gpkg", "F_dtm.tif")):

@@ -14,6 +14,7 @@ import geopandas as gpd
 import numpy as np
 import pytest
 from products import SURVEYS, content, many, tree
+from systems import POSIX
 
 from vinemap import paths
 from vinemap.config import survey_config
@@ -220,7 +221,7 @@ def children(group):
     return [line for line in listed.splitlines() if line.split()[0] == str(group) and "Z" not in line]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no such signals here")
+@POSIX
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     """Stopped as by Ctrl-C, to all its processes, or by a scheduler, to the first alone, while parcels are worked."""
@@ -245,7 +246,7 @@ def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     assert all((tmp_path / "out" / name / "run.json").is_file() for name in done)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no such signals here")
+@POSIX
 def test_a_job_that_is_killed_loses_nothing(cloud, tmp_path):
     """Killed at any instant while it replaces products: each parcel's is whole, and the next job makes the rest."""
     many(cloud, tmp_path / "many.gpkg", 3)

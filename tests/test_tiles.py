@@ -1,7 +1,6 @@
 """Clouds in tiles on disk: no point lost or twice, and the same result as in memory."""
 
 import json
-import os
 import subprocess
 import sys
 
@@ -13,6 +12,7 @@ import pytest
 import rasterio
 import shapely
 from pyproj import CRS
+from systems import POSIX
 
 from vinemap import paths
 from vinemap.cloud import PointCloud
@@ -297,7 +297,7 @@ main()
 """
 
 
-@pytest.mark.skipif(os.name != "posix", reason="no limit of files' sizes here")
+@POSIX
 @pytest.mark.parametrize("command", ["run", "survey"])
 def test_a_full_disk_is_one_line(tmp_path, survey, command):
     """Files that may not grow further are written as to a full disk."""

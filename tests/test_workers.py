@@ -15,13 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from systems import LINUX, POSIX
 
 from vinemap import workers
 from vinemap.errors import BusyError, InputError, WorkerError
 from vinemap.workers import Worker, Workers
 
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="needs what only Linux has")
-POSIX = pytest.mark.skipif(os.name != "posix", reason="needs signals of POSIX")
 SOON = 5.0
 """Seconds."""
 

@@ -185,7 +185,7 @@ def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | Non
 @click.option("--outer", is_flag=True, help="Lanes beside the first row of a block and its last, too.")
 @click.option("--frame", default="map", help="Name of the frame of a robot's coordinates; map by default.")
 @click.option("--grid", is_flag=True, help="Robots' coordinates and meshes in the product's CRS; in {Main} by default.")
-@click.option("--vertices", type=click.IntRange(2, 10_000), help="Vertices of each line for opennav_coverage.")
+@click.option("--vertices", type=click.IntRange(2, 10_000), help="Vertices of every lane; by default few.")
 def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | None, **options: Any) -> None:
     """Write the rows of each PRODUCT (its folder or GeoPackage), and lanes between them, for tractors and robots."""
     from vinemap import paths

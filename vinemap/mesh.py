@@ -11,6 +11,7 @@ import numpy as np
 
 import vinemap
 from vinemap.errors import DependencyError
+from vinemap.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -203,7 +204,7 @@ def write_glb(
 
     zero = np.asarray(origin, dtype=np.float64)
     placed = {"crs": crs, **(extras or {}), "origin": zero}
-    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=_plain(placed))
+    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=jsonable(placed))
     out = gltf.GLTF2(
         asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
         scene=0,
@@ -213,7 +214,7 @@ def write_glb(
     positions, indices = bytearray(), bytearray()
     stored: dict[bytes, int] = {}
     for mesh in meshes:
-        node = gltf.Node(name=mesh.label, extras=_plain({"row_id": mesh.row_id, **mesh.extras}))
+        node = gltf.Node(name=mesh.label, extras=jsonable({"row_id": mesh.row_id, **mesh.extras}))
         out.nodes.append(node)
         if len(mesh.faces) == 0:
             continue
@@ -310,19 +311,6 @@ def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
 def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:
     data += pad * (-len(data) % 4)
     return struct.pack("<I4s", len(data), kind) + data
-
-
-def _plain(value: Any) -> Any:  # any JSON
-    """A value as JSON has it: numpy's numbers as Python's, what isn't finite as null (dropped from a mapping)."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def audit(mesh: Mesh) -> Audit:

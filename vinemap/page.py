@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 
 from vinemap import paths
+from vinemap.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -108,20 +109,7 @@ def _pack(data: bytes) -> str:
 
 def as_json(data: Any) -> str:
     """Data as JSON, in which what isn't finite is null."""
-    return json.dumps(plain(data), allow_nan=False, separators=(",", ":"))
-
-
-def plain(value: Any) -> Any:
-    """A value of Python's own kinds alone: numpy's numbers and arrays as those, what isn't finite as None."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(jsonable(data), allow_nan=False, separators=(",", ":"))
 
 
 def whole_numbers(values: ArrayLike, *, unit: float) -> list[int | None]:

@@ -14,6 +14,8 @@ import matplotlib as mpl
 import numpy as np
 import rasterio
 import shapely
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
 
 from vinemap import paths
 from vinemap.mesh_files import read_glb
@@ -60,8 +62,6 @@ def _map(axes: Axes, product: Path, parcel: str) -> None:
     layers = {name: gpd.read_file(paths.geopackage(product, parcel), layer=name) for name in ("rows", "gaps", "parcel")}
     chm, where = _read(paths.raster(product, parcel, "chm"))
     dtm, _ = _read(paths.raster(product, parcel, "dtm"))
-    from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
-
     relief = LightSource(azdeg=315, altdeg=45).hillshade(dtm, vert_exag=2, dx=0.25, dy=0.25)
     outline = layers["parcel"].union_all()
     x = np.linspace(*where[:2], chm.shape[1])
@@ -96,8 +96,6 @@ def _read(path: Path) -> tuple[NDArray[np.float64], tuple[float, float, float, f
 
 def _scene(axes: Axes, product: Path, parcel: str) -> None:
     """Facets of ground and canopies in their order from back to front, lit by the sun."""
-    from matplotlib.collections import PolyCollection
-
     facets = [_ground(product, parcel), _canopies(product, parcel)]
     corners = np.concatenate([at for at, _ in facets])
     colours = np.concatenate([np.broadcast_to(colour, (len(at), 3)) for at, colour in facets])

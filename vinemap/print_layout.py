@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinemap.symbology import node, options, single_symbol
+from vinemap.symbology import node, options, rgba, single_symbol
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ LETTERS = 36
 """Of a title at full size; as many fit even where all are as wide as high."""
 MARGIN = 1.06
 """What is shown over the parcel's size."""
-INK = "29,43,36,255"
+INK = "#1d2b24"
 BAR = 25.0
 """Least length of a half of the scale bar, mm."""
 MAP_ITEM, PICTURE, LABEL, LEGEND, SCALE_BAR, PAGE_ITEM = (str(65638 + k) for k in (1, 2, 3, 4, 8, 0))
@@ -101,9 +101,14 @@ def _map(bounds: Sequence[float], scale: int) -> Element:
 
 def _text(text: str, place: tuple[float, float, float, float], *, size: float, bold: bool = False) -> Element:
     font = node("LabelFont", description=_font(size, bold=bold), style="")
-    ink = node("FontColor", red=29, green=43, blue=36, alpha=255)
+    ink = _colour("FontColor", INK)
     literal = text.replace("[%", "[%'['%]%")  # else QGIS takes it for an expression
     return _item(LABEL, place, font, ink, labelText=literal, htmlState=0, halign=1, valign=32, marginX=0, marginY=0)
+
+
+def _colour(tag: str, colour: str) -> Element:
+    red, green, blue, alpha = rgba(colour).split(",")
+    return node(tag, red=red, green=green, blue=blue, alpha=alpha)
 
 
 def _font(size: float, *, bold: bool = False) -> str:
@@ -143,7 +148,7 @@ def _legend(layers: Sequence[tuple[str, str, str]]) -> Element:
         lineSpacing=1,
         symbolAlignment=1,
         titleAlignment=1,
-        fontColor="#1d2b24",
+        fontColor=INK,
     )
 
 
@@ -159,10 +164,12 @@ def _scale_bar(scale: int) -> Element:
     return _item(
         SCALE_BAR,
         (COLUMN, 155, 2 * millimetres + 8, 12),
-        node("text-style", fontFamily="Sans Serif", fontSize=8, fontSizeUnit="Point", textColor=INK, textOpacity=1),
-        node("fillColor", red=29, green=43, blue=36, alpha=255),
-        node("fillColor2", red=255, green=255, blue=255, alpha=255),
-        node("strokeColor", red=29, green=43, blue=36, alpha=255),
+        node(
+            "text-style", fontFamily="Sans Serif", fontSize=8, fontSizeUnit="Point", textColor=rgba(INK), textOpacity=1
+        ),
+        _colour("fillColor", INK),
+        _colour("fillColor2", "#ffffff"),
+        _colour("strokeColor", INK),
         mapUuid=MAP_ID,
         style="Single Box",
         unitType="meters",
@@ -192,7 +199,7 @@ def _arrow() -> Element:
         resizeMode=0,
         northMode=0,
         mapUuid=MAP_ID,
-        svgFillColor="29,43,36,255",
-        svgBorderColor="29,43,36,255",
+        svgFillColor=rgba(INK),
+        svgBorderColor=rgba(INK),
         svgBorderWidth=0.2,
     )

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 MARGIN = 0.06
 """Share of the parcel's size that the map shows about it."""
 GEOMETRY = {"parcel": "Polygon", "row_ends": "Point", "key_points": "Point"}
-
-
 LEGEND = ("rows", "gaps", "parcel", "chm")
 
 
@@ -192,7 +190,8 @@ def _id(entry: Entry) -> str:
 def _srs(crs: CRS) -> Element:
     authority = crs.to_authority()
     known = [node("authid", ":".join(authority))] if authority else []
-    return node("spatialrefsys", node("wkt", crs.to_wkt()), *known, node("description", crs.name))
+    # WKT 2 has a datum or its ensemble, as PROJ's state will have it; WKT 1 is the same each time.
+    return node("spatialrefsys", node("wkt", crs.to_wkt("WKT1_GDAL")), *known, node("description", crs.name))
 
 
 def _extent(parcel: gpd.GeoDataFrame) -> dict[str, str]:

@@ -77,7 +77,7 @@ class Field(NamedTuple):
             yield name, self._replace(rows=rows, lanes=lanes)
 
 
-def read_field(product: Path, *, lines: str, headland: float, outer: bool) -> Field:
+def read_field(product: Path, *, lines: str, headland: float, outer: bool, vertices: int | None = None) -> Field:
     """Read a product, given by its folder or its GeoPackage, and draw its lanes if they are wanted.
 
     Raises
@@ -103,7 +103,7 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool) -> Fi
     rows = layers["rows"].sort_values("row_id", ignore_index=True)
     if len(rows) == 0:
         raise InputError(f"{paths.shown(path)}: has no row to export")
-    lanes = lanes_between(rows if lines != "rows" else rows[:0], headland=headland, outer=outer)
+    lanes = lanes_between(rows if lines != "rows" else rows[:0], headland=headland, outer=outer, vertices=vertices)
     if lines != "rows" and len(lanes) == 0:
         raise InputError(
             f"{paths.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"

@@ -54,9 +54,9 @@ def export_products(
         Of :data:`vinemap.export.FORMATS`.
     lines : str
         What guidance is written of: "lanes", "rows" or "both".
-    headland, outer
-        As for :func:`vinemap.lanes.lanes_between`.
-    frame, grid, vertices
+    headland, outer, vertices
+        As for :func:`vinemap.lanes.lanes_between`; rows for opennav_coverage have as many vertices, too.
+    frame, grid
         As for :func:`vinemap.export.opennav_coverage.write_opennav_coverage`.
 
     Raises
@@ -69,7 +69,8 @@ def export_products(
     if "nav2" in formats and lines == "rows":
         raise InputError("nav2 needs lanes: leave --lines rows out, or name the other formats")
     wanted = lines if set(formats) - set(MESHES) else "rows"
-    fields = [read_field(product, lines=wanted, headland=headland, outer=outer) for product in products]
+    drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
+    fields = [read_field(product, lines=wanted, **drawn) for product in products]
     names = [field.parcel for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
@@ -85,12 +86,13 @@ def export_products(
         "ply": (write_canopy, {"kind": "ply", "grid": grid}),
         "shapefile": (write_shapefile, {}),
     }
-    drawn = {"lines": lines, "headland": headland, "outer": outer}
     for field in fields:
         for kind in formats:
             write, options = writers[kind]
             target = paths.export_folder(out, field.parcel, kind)
-            _write_whole(target, partial(write, field, **options), _record(field, kind, drawn | options))
+            _write_whole(
+                target, partial(write, field, **options), _record(field, kind, {"lines": lines} | drawn | options)
+            )
         yield (
             f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(out / field.parcel)} "
             f"({', '.join(formats)})"
