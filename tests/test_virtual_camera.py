@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
+from vinemap.poses import Pose, moved
 from vinemap.virtual_camera import (
     HIGH,
     LOW,
     RESOLUTION,
     Ground,
-    Pose,
     Weather,
     lay_ground,
-    moved,
     render,
     rough,
     sinusoid,
@@ -20,6 +19,7 @@ from vinemap.virtual_camera import (
 )
 
 CLEAR = Weather(0, 0)
+AHEAD = LOW.model_copy(update={"x_mm": 0.0})
 
 
 def dot(x_mm, y_mm, size=1201):
@@ -39,7 +39,7 @@ def seen_at(image):
 @pytest.mark.parametrize("camera", [LOW, HIGH])
 @pytest.mark.parametrize("heading", [0, 20, -65])
 def test_a_point_of_the_ground_is_seen_where_it_is(camera, heading):
-    a, camera = np.radians(heading), camera._replace(x_mm=40.0)
+    a, camera = np.radians(heading), camera.model_copy(update={"x_mm": 40.0})
     robot = Pose(-30.0, 12.0, heading)
     place = np.array([20.0, 15.0])  # in the robot's frame
     on_ground = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ place + robot[:2]
@@ -51,8 +51,8 @@ def test_a_point_of_the_ground_is_seen_where_it_is(camera, heading):
 def test_what_is_higher_is_seen_further_out(height):
     ground = dot(60, 0)
     ground = ground._replace(relief=np.full(ground.image.shape, height, np.float32))
-    column, row = seen_at(render(ground, Pose(0, 0, 0), camera=LOW._replace(x_mm=0), weather=CLEAR))
-    assert LOW._replace(x_mm=0).ground(column, row) == pytest.approx([60 * 245 / (245 - height), 0], abs=0.05)
+    column, row = seen_at(render(ground, Pose(0, 0, 0), camera=AHEAD, weather=CLEAR))
+    assert AHEAD.ground(column, row) == pytest.approx([60 * 245 / (245 - height), 0], abs=0.05)
 
 
 def test_movement_is_seen_from_where_the_robot_was():
@@ -90,7 +90,7 @@ def test_relief_is_as_told():
 
 def test_weather_is_as_told():
     ground = Ground(np.full((1001, 1001), 120, np.uint8))
-    camera = LOW._replace(x_mm=0)
+    camera = AHEAD
     noisy = render(ground, Pose(0, 0, 0), camera=camera, weather=Weather(3, 0)).astype(float)
     uneven = render(ground, Pose(0, 0, 0), camera=camera, weather=Weather(0, 0.05)).astype(float)
     assert noisy.std() == pytest.approx(3, abs=0.1)

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 import numpy as np
 
-from vinemap.odometry import Camera, Motion, estimate_motion
+from vinemap.odometry import estimate_motion
+from vinemap.poses import Pose, moved, onward
 from vinemap.tables import as_text
 from vinemap.virtual_camera import (
     HIGH,
@@ -20,9 +21,7 @@ from vinemap.virtual_camera import (
     MADE,
     PHOTOGRAPHS,
     Ground,
-    Pose,
     lay_ground,
-    moved,
     render,
     rough,
     sinusoid,
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from vinemap.camera import Camera
     from vinemap.odometry import Method
     from vinemap.virtual_camera import Image
 
@@ -64,7 +64,7 @@ class Errors(NamedTuple):
         return float(np.median(self.place))
 
 
-Step = tuple["Image", "Image", tuple[float, float, float]]
+Step = tuple["Image", "Image", Pose]
 
 
 def steps_of(ground: Ground, poses: Sequence[Pose], *, camera: Camera = LOW, seed: int = 0) -> Iterator[Step]:
@@ -74,12 +74,12 @@ def steps_of(ground: Ground, poses: Sequence[Pose], *, camera: Camera = LOW, see
         yield *pair, moved(*step)
 
 
-def template_error(motion: Motion, truth: tuple[float, float, float], camera: Camera) -> float:
-    """Millimetres from where a template is found to where it is."""
-    a = np.radians(truth[2])
-    was = camera.ground(camera.width // 2, camera.height // 2)
-    true = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) @ (was - truth[:2])
-    return float(np.hypot(*(camera.ground(motion.column, motion.row) - true)))
+def template_error(movement: Pose, truth: Pose, camera: Camera) -> float:
+    """Millimetres in the next frame from where the middle of a frame is found to where it is."""
+    x, y = camera.ground(camera.width // 2, camera.height // 2)
+    middle = Pose(x, y, 0.0)
+    found, true = (moved(step, middle) for step in (movement, truth))
+    return float(np.hypot(found.x_mm - true.x_mm, found.y_mm - true.y_mm))
 
 
 def measure(steps: Iterator[Step], methods: Sequence[Method], *, camera: Camera = LOW) -> dict[Method, Errors]:
@@ -90,7 +90,7 @@ def measure(steps: Iterator[Step], methods: Sequence[Method], *, camera: Camera 
             began = time.perf_counter()
             motion = estimate_motion(frame, next_frame, camera=camera, method=method)
             took = time.perf_counter() - began
-            off = template_error(motion, truth, camera), abs(motion.rotation_deg - truth[2])
+            off = template_error(motion.movement, truth, camera), abs(motion.rotation_deg - truth.heading_deg)
             errors.append((*off, motion.flag != "", took))
     return {method: Errors(*np.transpose(errors)) for method, errors in found.items()}
 
@@ -156,7 +156,7 @@ def paths(count: int) -> str:
         for frame, next_frame, _ in steps_of(ground, shifted, seed=1000 * k):
             for method, track in tracks.items():
                 motion = estimate_motion(frame, next_frame, camera=LOW, method=method)
-                track.append(_onward(track[-1], motion))
+                track.append(onward(track[-1], motion.movement))
         for method, track in tracks.items():
             off = moved(shifted[-1], track[-1])
             gathered[method].append((float(np.hypot(*off[:2])) / length, abs(off[2]) / length))
@@ -179,14 +179,6 @@ def _fastest(pair: Sequence[Image], camera: Camera, share: float, repeats: int) 
         estimate_motion(*pair, camera=camera, template_share=share)
         took.append(time.perf_counter() - began)
     return float(np.median(took))
-
-
-def _onward(pose: Pose, motion: Motion) -> Pose:
-    """The pose after a movement."""
-    a = np.radians(pose.heading_deg)
-    x = pose.x_mm + motion.dx_mm * np.cos(a) - motion.dy_mm * np.sin(a)
-    y = pose.y_mm + motion.dx_mm * np.sin(a) + motion.dy_mm * np.cos(a)
-    return Pose(float(x), float(y), pose.heading_deg + motion.rotation_deg)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})

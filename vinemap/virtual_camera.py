@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap.camera import Camera
 from vinemap.errors import DependencyError
-from vinemap.odometry import Camera
+from vinemap.poses import Pose
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,8 +17,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.floating]
     Image = NDArray[np.uint8]
 
-LOW = Camera()
-HIGH = Camera(1280, 720, 888.8749, 888.5340)
+LOW = Camera(width=320, height=240, fx=299.4303, fy=299.4122, above_ground_mm=245.0, x_mm=950.0)
+HIGH = Camera(width=1280, height=720, fx=888.8749, fy=888.5340, above_ground_mm=245.0, x_mm=950.0)
 """The two cameras of Table 4.1, the size as width × height."""
 PHOTOGRAPHS = ("gravel", "grass", "brick")
 """Public domain (CC0) photographs of scikit-image, 512 × 512 pixels."""
@@ -24,8 +26,8 @@ MADE = ("soil", "asphalt", "concrete")
 """Grounds that are made of noise."""
 RESOLUTION = 0.4
 """Millimetres in a pixel of a ground."""
-SUPERSAMPLING = {LOW: 3, HIGH: 1}
-"""Rays along each side of a pixel."""
+RAY = 0.3
+"""Millimetres of ground between two rays, at most; the high resolution's pixels have one ray each."""
 PIECE = 256
 """Pixels across each piece of a photograph that grounds are laid of."""
 
@@ -37,15 +39,6 @@ class Ground(NamedTuple):
     """Grey levels (ny, nx), :data:`RESOLUTION` mm apart, the first row at the top."""
     relief: Array | None = None
     """Height above the plane in mm, of the same shape."""
-
-
-class Pose(NamedTuple):
-    """Where a robot is on the ground."""
-
-    x_mm: float
-    y_mm: float
-    heading_deg: float
-    """Anticlockwise from the x axis."""
 
 
 class Weather(NamedTuple):
@@ -98,10 +91,7 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     import cv2
 
     rng = np.random.default_rng(seed)
-    n = SUPERSAMPLING.get(camera, 1)
-    right = (np.arange(camera.width * n) + 0.5) / n - camera.width / 2
-    down = (np.arange(camera.height * n) + 0.5) / n - camera.height / 2
-    rays: tuple[Array, Array] = np.meshgrid(right / camera.fx, -down / camera.fy)
+    rays = _rays(camera)
     columns, rows = _seen(ground, pose, camera, rays, np.zeros((1, 1)))
     ny, nx = ground.image.shape
     if min(columns.min(), rows.min()) < 1 or columns.max() > nx - 2 or rows.max() > ny - 2:
@@ -120,14 +110,6 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     noisy = values * light + rng.normal(0, weather.noise, values.shape)
     out: Image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
     return out
-
-
-def moved(pose: Pose, next_pose: Pose) -> tuple[float, float, float]:
-    """Forward, to the left in mm, and turned in degrees: the next pose in the frame of one."""
-    a = np.radians(pose.heading_deg)
-    x, y = next_pose.x_mm - pose.x_mm, next_pose.y_mm - pose.y_mm
-    turn = (next_pose.heading_deg - pose.heading_deg + 180) % 360 - 180
-    return x * np.cos(a) + y * np.sin(a), y * np.cos(a) - x * np.sin(a), turn
 
 
 def sinusoid(
@@ -169,6 +151,23 @@ def wander(
             step = step_mm * np.sqrt(rng.uniform()) * np.array([np.cos(away), np.sin(away)])
         place = place + step
     return poses
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera) -> tuple[Array, Array]:
+    """Directions of a camera's rays, forward and to the left over downward, some for each pixel."""
+    import cv2
+
+    n = max(1, round(camera.above_ground_mm / camera.fx / RAY))
+    columns = (np.arange(camera.width * n) + 0.5) / n - 0.5
+    rows = (np.arange(camera.height * n) + 0.5) / n - 0.5
+    points: Array = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+    if camera.distortion:
+        lens = np.array(camera.distortion)
+        points = np.asarray(cv2.undistortPoints(points, camera.matrix, lens, P=camera.matrix), float)
+    forward, left = (camera.to_robot[:, :2] @ (points[:, 0] - camera.axis).T) / camera.above_ground_mm
+    shape = len(rows), len(columns)
+    return forward.reshape(shape), left.reshape(shape)
 
 
 def _seen(ground: Ground, pose: Pose, camera: Camera, rays: tuple[Array, Array], height: Array) -> tuple[Array, Array]:
