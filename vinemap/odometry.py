@@ -24,7 +24,7 @@ from vinemap.correlation import (
     warp,
 )
 from vinemap.errors import InputError
-from vinemap.poses import Pose
+from vinemap.poses import Pose, onward
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -237,14 +237,29 @@ def motion_between(
     return _motion(camera, centre, place, score, agreement, rival, overlap, flag)
 
 
+def expected_overlap(camera: Camera, movement: Pose) -> float:
+    """Share of a frame that the next one should show too after a movement, turns left aside."""
+    middle, then = _middle(camera), _next_middle(camera, movement)
+    right, down = np.clip(1 - np.abs(then - middle) / [camera.width, camera.height], 0, 1)
+    return float(right * down)
+
+
+def _middle(camera: Camera) -> Array:
+    """Column and row of the middle of a frame."""
+    return np.array([camera.width // 2, camera.height // 2])
+
+
+def _next_middle(camera: Camera, movement: Pose) -> Array:
+    """Column and row in a frame of the middle of the next."""
+    x, y = camera.ground(*_middle(camera))
+    there = onward(movement, Pose(x, y, 0.0))
+    return camera.pixel(there.x_mm, there.y_mm)
+
+
 def _template_centre(camera: Camera, half: int, expected: Pose | None) -> tuple[int, int]:
     """Row and column of the template: the image's middle, or that of what both frames should show."""
-    middle = np.array([camera.width // 2, camera.height // 2])
-    if expected is None:
-        return int(middle[1]), int(middle[0])
-    x, y = camera.ground(*middle)
-    c, s = np.cos(np.radians(expected.heading_deg)), np.sin(np.radians(expected.heading_deg))
-    then = camera.pixel(expected.x_mm + c * x - s * y, expected.y_mm + s * x + c * y)
+    middle = _middle(camera)
+    then = _next_middle(camera, expected) if expected else middle
     room = np.array([camera.width, camera.height]) - 1 - half
     column, row = np.clip(np.rint((middle + then) / 2), half, room).astype(int)
     return int(row), int(column)

@@ -1,0 +1,140 @@
+"""The track of a robot: the poses of its frames, each measured from an earlier frame, or guessed and flagged."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from vinemap.odometry import ANGLES, LEAST_CONTRAST, expected_overlap, motion_between, view_of
+from vinemap.poses import STILL, Pose, moved, onward
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from vinemap.camera import Camera
+    from vinemap.frames import Frame
+    from vinemap.odometry import Method, Motion, View
+
+KEY_OVERLAP = 0.4
+"""Share of a frame that a keyframe must have in common with the frames that are measured from it."""
+
+
+class Fix(NamedTuple):
+    """Where the robot was when a frame was taken."""
+
+    frame: str
+    time: float | None
+    """Seconds, as the recording tells them."""
+    pose: Pose
+    """In the robot's frame at the first frame that shows something."""
+    score: float
+    agreement: float
+    overlap: float
+    """Of the step from the frame from which it was measured: see :class:`vinemap.odometry.Motion`."""
+    flag: str
+    """Why it couldn't be measured; empty where it was. A flagged pose is carried on by the last movement."""
+    measured_from: int | None
+    """Number of the frame, from 0 on, from which it was measured."""
+
+
+class _Anchor(NamedTuple):
+    """A frame from which others are measured."""
+
+    number: int
+    view: View
+    pose: Pose
+
+
+def follow(
+    frames: Iterable[Frame],
+    *,
+    camera: Camera,
+    template_share: float = 0.2,
+    angles: tuple[float, float] = ANGLES,
+    method: Method = "aligned",
+    keyframes: bool = True,
+) -> Iterator[Fix]:
+    """Follow a robot frame by frame, each pose told as soon as its frame is there.
+
+    A frame is measured from a keyframe as long as both show enough of the same ground, as each measured step adds its
+    error (Section 4.4); then the frame before becomes the keyframe. Where a step isn't to be believed, the frame is
+    tried from the frame before as well; the pose is flagged if that doesn't help, and the next frames are tried from
+    the last good frames first, which mends a single bad one, and else from the flagged one.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        Each looked at once, and no more than three of them are kept.
+    camera, template_share, angles, method
+        As for :func:`vinemap.odometry.estimate_motion`.
+    keyframes : bool
+        Whether frames are measured from keyframes, or each from the one before.
+
+    Raises
+    ------
+    InputError
+        As for :func:`vinemap.odometry.estimate_motion`.
+    """
+
+    def measure(anchor: _Anchor, view: View, expected: Pose | None) -> Motion:
+        return motion_between(
+            anchor.view,
+            view,
+            camera=camera,
+            template_share=template_share,
+            angles=angles,
+            method=method,
+            expected=expected,
+        )
+
+    key = last = lost = None
+    pose, velocity = STILL, STILL
+    for number, frame in enumerate(frames):
+        pose = onward(pose, velocity)
+        if frame.image is None:
+            yield _guess(frame, pose, frame.flaw)
+            continue
+        view = view_of(frame.image, camera=camera, method=method)
+        if view.contrast < LEAST_CONTRAST:
+            yield _guess(frame, pose, "blank")
+            continue
+        if key is None or last is None:
+            key = last = _Anchor(number, view, pose)
+            yield _guess(frame, pose, "")
+            continue
+        if not keyframes or expected_overlap(camera, moved(key.pose, pose)) < KEY_OVERLAP:
+            key = last
+        attempts = [(key, moved(key.pose, pose)), (last, moved(last.pose, pose)), (last, None)]
+        attempts = attempts[key is last :] + ([(lost, None)] if lost else [])
+        reasons = []
+        for anchor, expected in attempts:
+            motion = measure(anchor, view, expected)
+            if not motion.flag:
+                break
+            reasons.append(motion.flag)
+        else:
+            lost = _Anchor(number, view, pose)
+            yield _guess(frame, pose, reasons[0])
+            continue
+        pose = onward(anchor.pose, motion.movement)
+        before = anchor if anchor is lost else last
+        velocity = _per_frame(moved(before.pose, pose), number - before.number)
+        last, key, lost = _Anchor(number, view, pose), anchor, None
+        yield Fix(frame.name, frame.time, pose, motion.score, motion.agreement, motion.overlap, "", anchor.number)
+
+
+def stretches(fixes: Iterable[Fix]) -> list[int]:
+    """Number, from 1 on, of the unbroken stretch of the track that each pose belongs to; 0 for poses that are alone."""
+    roots: list[int] = []
+    for number, fix in enumerate(fixes):
+        roots.append(number if fix.measured_from is None else roots[fix.measured_from])
+    counts = {root: roots.count(root) for root in set(roots)}
+    known = {root: k for k, root in enumerate((r for r in sorted(counts) if counts[r] > 1), start=1)}
+    return [known.get(root, 0) for root in roots]
+
+
+def _guess(frame: Frame, pose: Pose, flag: str) -> Fix:
+    return Fix(frame.name, frame.time, pose, 0.0, 0.0, 0.0, flag, None)
+
+
+def _per_frame(movement: Pose, frames: int) -> Pose:
+    return Pose(*(value / frames for value in movement))
