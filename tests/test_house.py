@@ -71,8 +71,12 @@ MAY_IMPORT = {
     "virtual_camera": {"errors", "camera", "poses"},
     "odometry_accuracy": {"camera", "poses", "odometry", "virtual_camera", "tables", "paths"},
     "settings": set(),
-    "config": BASE | {"settings", "paths"},
-    "template": {"settings", "config"},
+    "config": BASE | {"camera", "settings", "paths"},
+    "template": {"camera", "settings", "config"},
+    "frames": {"errors", "camera"},
+    "track": {"camera", "frames", "odometry", "poses"},
+    "track_table": {"crs", "errors", "poses", "track"},
+    "drive": BASE | {"camera", "evaluate", "frames", "odometry", "track", "track_table", "vector"},
     "paths": set(),
     "store": {"errors", "paths"},
     "recipe": CHAIN,
@@ -107,9 +111,9 @@ MAY_IMPORT = {
     "bench": {"errors", "paths", "tables", "processes", "cli"},
     "tune": CHAIN | {"parcel", "cli"},
     "picture": {"paths", "style", "mesh_files"},
-    "cli": CHAIN | {"parcel", "plan", "survey", "template", "export", "export.write"},
+    "cli": CHAIN | {"drive", "parcel", "plan", "survey", "template", "export", "export.write"},
     "__main__": {"cli"},
-    "flows": CHAIN | {"parcel", "recipe", "plan", "survey", "estate", "processes", "cli", "flows"},
+    "flows": CHAIN | {"drive", "parcel", "recipe", "plan", "survey", "estate", "processes", "cli", "flows"},
 }
 
 

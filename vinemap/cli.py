@@ -7,7 +7,7 @@ import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
@@ -16,9 +16,15 @@ from vinemap.errors import VinemapError, own_fault
 from vinemap.export import FORMATS, LINES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
+
+    from rich.progress import Progress, ProgressColumn
+
+T = TypeVar("T")
 
 FILE = click.Path(path_type=Path)
+SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+METHODS = ("aligned", "quadratic", "centroid", "maximum")
 
 
 class _Origin(click.ParamType):  # type: ignore[type-arg]
@@ -34,6 +40,23 @@ class _Origin(click.ParamType):  # type: ignore[type-arg]
                 f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx
             )
         return check_origin(Origin(lat, lon, alt))
+
+
+class _Start(click.ParamType):  # type: ignore[type-arg]
+    name = "LAT,LON,HEADING"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from vinemap.crs import Start, check_start
+
+        try:
+            start = Start(*(float(part) for part in str(value).split(",")))
+        except (TypeError, ValueError):
+            self.fail(
+                f"{value!r} isn't latitude, longitude and heading in degrees: for example 44.61167,7.92442,72.5",
+                param,
+                ctx,
+            )
+        return check_start(start)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -138,11 +161,12 @@ def survey(
 
 
 @commands.command()
-@click.argument("kind", type=click.Choice(["estate", "survey", "settings"]), default="estate")
+@click.argument("kind", type=click.Choice(["estate", "survey", "settings", "camera"]), default="estate")
 def config(kind: str) -> None:
     """Print all that can be configured, with its defaults, as a commented YAML file.
 
-    KIND is what the file is for: the surveys of an estate night after night, one survey, or the stages alone.
+    KIND is what the file is for: the surveys of an estate night after night, one survey, the stages alone, or the
+    camera of a robot.
     """
     from vinemap.template import template
 
@@ -196,15 +220,66 @@ def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | Non
         click.echo(line)
 
 
+@commands.command()
+@click.argument("frames", nargs=-1, required=True, type=FILE)
+@click.option("--camera", type=FILE, required=True, help="YAML file of the camera: see vinemap config camera.")
+@click.option("--out", type=FILE, default="track.gpkg", help="GeoPackage to write; track.gpkg by default.")
+@click.option("--start", type=_Start(), help="Where the first frame was taken, heading clockwise from north.")
+@click.option("--rows", type=FILE, help="GeoPackage of vine rows, for the distance to the nearest one.")
+@click.option(
+    "--template-share",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.2,
+    help="Template, of the image's height; 0.2.",
+)
+@click.option("--turn", type=click.FloatRange(1, 90), default=9.0, help="Most degrees a frame; 9 by default.")
+@click.option(
+    "--method", type=click.Choice(METHODS), default="aligned", help="How peaks are refined; aligned by default."
+)
+def track(
+    frames: tuple[Path, ...],
+    camera: Path,
+    out: Path,
+    start: Any,
+    rows: Path | None,
+    template_share: float,
+    turn: float,
+    method: Any,
+) -> None:
+    """Follow a robot by the FRAMES of its camera that looks down: images, folders of images, or videos, in order."""
+    from vinemap.config import load_camera
+    from vinemap.drive import map_drive
+
+    summary = map_drive(
+        frames,
+        out,
+        camera=load_camera(camera),
+        start=start,
+        rows=rows,
+        template_share=template_share,
+        angles=(-turn, turn),
+        method=method,
+        show=frame_progress,
+    )
+    click.echo(summary.line())
+
+
+def frame_progress(frames: Iterable[T], count: int) -> Iterator[T]:
+    """Give frames on and move a bar, on stderr."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("Frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with _bar(*columns) as bar:
+        yield from bar.track(frames, total=count)
+
+
 @contextmanager
 def progress(parcel: str) -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with _bar(*columns) as bar:
         task = bar.add_task("Starting", total=None, parcel=parcel)
 
         def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -214,6 +289,15 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
             return function(*args, **kwargs)
 
         yield step
+
+
+def _bar(*columns: ProgressColumn) -> Progress:
+    """A bar on stderr that isn't there where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def main() -> None:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
-from vinemap.crs import Origin, check_origin, parse_crs
+from vinemap.camera import Camera
+from vinemap.crs import Origin, Start, check_origin, check_start, parse_crs
 from vinemap.errors import ConfigError, InputError
 from vinemap.paths import LONGEST_NAME, MOST_BYTES
-from vinemap.settings import Options, Settings
+from vinemap.settings import OdometryOptions, Options, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,6 +70,7 @@ def _checked(check: Callable[[T], Any]) -> AfterValidator:
 
 Name = Annotated[str, AfterValidator(lambda name: unicodedata.normalize("NFC", name)), _checked(check_name)]
 MainOrigin = Annotated[Origin, _checked(check_origin)]
+MapStart = Annotated[Start, _checked(check_start)]
 
 
 class JobOptions(Options):
@@ -181,6 +183,23 @@ class EstateConfig(_Surveys):
         return _validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
 
 
+class DriveConfig(Options):
+    """One drive of a robot."""
+
+    frames: list[Path] = Field(min_length=1, description="images, folders of images, or videos, in order")
+    start: MapStart | None = Field(None, description="latitude, longitude, heading clockwise from north (degrees)")
+
+
+class DrivesConfig(Options):
+    """Drives of a robot whose tracks are made in one job."""
+
+    camera: Path = Field(description="file of the robot's camera")
+    rows: Path | None = Field(None, description="vine rows, for the distance to the nearest one")
+    out: Path = Field(Path("data/tracks"), description="folder of the tracks")
+    odometry: OdometryOptions = OdometryOptions()
+    drives: dict[Name, DriveConfig] = Field(min_length=1, description="the drives by their names")
+
+
 def merge(common: Any, own: Any) -> Any:
     """Options with others laid over them, key by key."""
     if isinstance(common, dict) and isinstance(own, dict) and common is not own:
@@ -213,6 +232,11 @@ def load_survey(path: Path) -> SurveyConfig:
     return _validated(SurveyConfig, _read_yaml(path), path)
 
 
+def load_drives(path: Path) -> DrivesConfig:
+    """Read the YAML file of a robot's drives; ConfigError names the key, its value and what it may be."""
+    return _validated(DrivesConfig, _read_yaml(path), path)
+
+
 def survey_config(**options: Any) -> SurveyConfig:
     """Configuration of a survey without a file; ConfigError as of :func:`load_survey`."""
     return _validated(SurveyConfig, {key: value for key, value in options.items() if value is not None}, None)
@@ -238,6 +262,11 @@ def load_settings(path: Path) -> Settings:
     return _validated(
         Settings, data["settings"] if isinstance(data, dict) and set(data) == {"settings"} else data, path
     )
+
+
+def load_camera(path: Path) -> Camera:
+    """Read the YAML file of a robot's camera; ConfigError names the key, its value and what it may be."""
+    return _validated(Camera, _read_yaml(path), path)
 
 
 class _Loader(yaml.SafeLoader):

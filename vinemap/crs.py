@@ -50,6 +50,28 @@ def check_origin(origin: Origin) -> Origin:
     return origin
 
 
+class Start(NamedTuple):
+    """Where a robot's first frame was taken: WGS84 latitude and longitude, heading clockwise from north, in degrees."""
+
+    lat: float
+    lon: float
+    heading_deg: float
+
+
+def check_start(start: Start) -> Start:
+    """Return a start that lies on the globe.
+
+    Raises
+    ------
+    ConfigError
+        If it doesn't, or its heading is no angle.
+    """
+    check_origin(Origin(start.lat, start.lon, 0.0))
+    if not abs(start.heading_deg) <= 360:
+        raise ConfigError(f"heading {start.heading_deg:g}: give degrees clockwise from north")
+    return start
+
+
 def parse_crs(text: str) -> CRS:
     """Read a CRS as a user writes it (``EPSG:32632``, ``32632``, WKT, PROJ).
 

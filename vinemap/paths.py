@@ -103,6 +103,11 @@ def classified_cloud(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_classified.laz"
 
 
+def track(folder: Path, drive: str) -> Path:
+    """GeoPackage of a robot's track."""
+    return folder / f"{drive}_track.gpkg"
+
+
 def exports() -> Path:
     """Folder of what is exported from products, apart from them."""
     return Path("exports")

@@ -46,10 +46,22 @@ WORDS = {
     "over": "Over-modelling",
     "reduction": "Complexity reduction",
     "quality": "Quality score",
+    "n_poses": "Poses",
+    "lat": "Latitude (°)",
+    "lon": "Longitude (°)",
+    "seconds": "Time (s)",
+    "time": "Date and time (UTC)",
+    "x_m": "East of the start (m)",
+    "y_m": "North of the start (m)",
+    "heading_deg": "Heading, clockwise from north (°)",
+    "measured_from": "Pose it was measured from",
+    "row": "Nearest row",
+    "row_distance_m": "Distance from that row (m)",
+    "row_position_m": "Position along that row (m)",
 }
 END_UNITS = {"x": "m", "y": "m", "z": "m", "lat": "°", "lon": "°", "alt": "m"}
 
-INK, PAPER, RED = "#1d2b24", "#ffffff", "#d7263d"
+INK, PAPER, RED, TRACK = "#1d2b24", "#ffffff", "#d7263d", "#1b6ca8"
 VIGOUR = ("#f7f06d", "#c2e06b", "#7cc96a", "#36a463", "#10775a", "#064b4a")
 """From little to much foliage, told apart by lightness alone as well."""
 TERRAIN = ("#3b5f4c", "#6c8c5a", "#a9b87a", "#dccfa0", "#c69f74", "#9a6b50", "#f4efe9")
@@ -69,12 +81,16 @@ SYMBOLS = {
     "sections": ("line", [{"line_width": "0.4", "capstyle": "flat"}]),
     "row_ends": ("marker", [{"color": rgba(PAPER), "outline_color": rgba(INK), "outline_width": "0.3", "size": "1.6"}]),
     "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
+    "track": ("line", [CASING | {"line_color": rgba(PAPER)}, {"line_color": rgba(TRACK), "line_width": "0.7"}]),
+    "poses": ("marker", [{"outline_style": "no", "size": "1.3"}]),
     "parcel": (
         "fill",
         [{"style": "no", "outline_color": rgba("#5b3f8c"), "outline_width": "0.6", "outline_style": "dash"}],
     ),
 }
-SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000}
+FLAGGED = "if(\"flag\" = '', 0, 1)"
+MEASURED_OR_NOT = [(-0.5, 0.5, "measured", TRACK), (0.5, 1.5, "flagged", RED)]
+SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000, "poses": 500}
 """Layers of small things show from this scale denominator on."""
 LABEL_SCALE = 4000
 MAP_TIPS = {
@@ -84,6 +100,9 @@ MAP_TIPS = {
     "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
     "[% round(width_m, 2) %] m wide",
     "row_ends": "<b>Row [% label %]</b>, end [% end %]",
+    "track": "<b>Stretch [% stretch %]</b><br>[% round(length_m, 2) %] m, [% n_poses %] poses",
+    "poses": "<b>[% frame %]</b><br>heading [% round(heading_deg, 1) %]°<br>score [% round(score, 2) %]"
+    "[% if(flag = '', '', '<br>flagged: ' || flag) %]",
 }
 
 
@@ -147,6 +166,8 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
         renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
     elif layer == "sections":
         renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
+    elif layer == "poses":
+        renderer = graduated(FLAGGED, MEASURED_OR_NOT, symbol)
     else:
         renderer = single(symbol)
     columns = [str(name) for name in table.columns if name != "geometry"]

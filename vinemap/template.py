@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 import yaml
 from pydantic_core import PydanticUndefined
 
+from vinemap.camera import Camera
 from vinemap.config import EstateConfig, SurveyConfig
 from vinemap.settings import Options, Settings
 
@@ -15,8 +16,13 @@ if TYPE_CHECKING:
 
     from pydantic.fields import FieldInfo
 
-KINDS: dict[str, type[Options]] = {"estate": EstateConfig, "survey": SurveyConfig, "settings": Settings}
-"""What can be configured: an estate's surveys night after night, one survey, the stages alone."""
+KINDS: dict[str, type[Options]] = {
+    "estate": EstateConfig,
+    "survey": SurveyConfig,
+    "settings": Settings,
+    "camera": Camera,
+}
+"""What can be configured: an estate's surveys night after night, one survey, the stages alone, a robot's camera."""
 LIMITS = {"ge": "from", "gt": "above", "le": "to", "lt": "below"}
 
 
@@ -26,7 +32,9 @@ def template(kind: str) -> str:
     Without changes it configures what stands there already, but for a survey's name, which has no default.
     """
     model = KINDS[kind]
-    head = [f"# {_sentence(model)}", "# Every key may be left out: these are the defaults.", ""]
+    needed = [name for name, field in model.model_fields.items() if field.examples]
+    free = f"{', '.join(needed)} are an example, all others" if needed else "Every key"
+    head = [f"# {_sentence(model)}", f"# {free} may be left out: these are the defaults.", ""]
     return "\n".join([*head, *_lines(model, "")]) + "\n"
 
 
@@ -47,8 +55,9 @@ def _sentence(model: type[Options]) -> str:
 
 
 def _default(field: FieldInfo, name: str) -> str:
-    value = name if field.default is PydanticUndefined else field.default
-    plain = value if value is None or isinstance(value, (bool, int, float, dict)) else str(value)
+    value = (field.examples or [name])[0] if field.default is PydanticUndefined else field.default
+    value = list(value) if isinstance(value, tuple) else value
+    plain = value if value is None or isinstance(value, (bool, int, float, dict, list)) else str(value)
     return yaml.safe_dump(plain, default_flow_style=True, width=200).splitlines()[0]
 
 

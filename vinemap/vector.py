@@ -32,7 +32,7 @@ SMALLEST = 1 << 20
 """Bytes that a GeoPackage needs: with fewer on the disk, SQLite fails in many ways."""
 PARCEL_LAYER = "parcel"
 NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
-TEXT, WHOLE, REAL = "str", "int64", "float64"
+TEXT, WHOLE, REAL, TIME = "str", "int64", "float64", "datetime64[ms, UTC]"
 
 
 class Layer(NamedTuple):
@@ -82,6 +82,23 @@ LAYERS: dict[str, Layer] = {
     ),
 }
 
+TRACK_LAYERS: dict[str, Layer] = {
+    "track": Layer(
+        "LineString",
+        {"stretch": WHOLE, "n_poses": WHOLE} | dict.fromkeys(("length_m", "seconds", "score"), REAL),
+        "The robot's track: a line for each stretch within which every pose was measured",
+    ),
+    "poses": Layer(
+        "Point",
+        {"pose": WHOLE, "frame": TEXT, "time": TIME, "seconds": REAL}
+        | dict.fromkeys(("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap"), REAL)
+        | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
+        | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
+        "Poses of the robot, one a frame",
+    ),
+}
+"""What the GeoPackage of a robot's track holds."""
+
 
 def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
     """Bring a table to a layer's columns, in order and with their types.
@@ -91,15 +108,21 @@ def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
     ValueError
         If a column is missing.
     """
-    columns = LAYERS[layer].columns
+    columns = (LAYERS | TRACK_LAYERS)[layer].columns
     missing = sorted(set(columns) - set(frame.columns))
     if missing:
         raise ValueError(f"layer {layer} lacks {', '.join(missing)}")
     return frame[[*columns, "geometry"]].astype(columns)
 
 
-def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date: datetime = EPOCH) -> None:
-    """Write all layers of the contract, and the styles that QGIS applies by itself.
+def write_geopackage(
+    layers: Mapping[str, gpd.GeoDataFrame],
+    path: Path,
+    *,
+    contract: Mapping[str, Layer] = LAYERS,
+    date: datetime = EPOCH,
+) -> None:
+    """Write all layers of a contract, and the styles that QGIS applies by itself.
 
     Parameters
     ----------
@@ -107,6 +130,8 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date
         The layers by name.
     path : Path
         The file.
+    contract : mapping of str to Layer
+        What it must hold; a product's layers by default.
     date : datetime
         Stands in it as that of the last change, so that the same layers always give the same file.
 
@@ -117,7 +142,7 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date
     """
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{date.astimezone(UTC):%Y-%m-%dT%H:%M:%S.000Z}"})
     try:
-        _write_layers(layers, path)
+        _write_layers(layers, path, contract)
     except (DataSourceError, DataLayerError, FeatureError) as error:
         if "full" in str(error) or shutil.disk_usage(path.parent).free < SMALLEST:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
@@ -126,9 +151,9 @@ def write_geopackage(layers: Mapping[str, gpd.GeoDataFrame], path: Path, *, date
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
-def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path) -> None:
-    tables = {name: conform(layers[name], name) for name in LAYERS}
-    for name, layer in LAYERS.items():
+def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path, contract: Mapping[str, Layer]) -> None:
+    tables = {name: conform(layers[name], name) for name in contract}
+    for name, layer in contract.items():
         with warnings.catch_warnings():
             # An empty column of text has no type of its own to infer.
             warnings.simplefilter("ignore", UserWarning)

@@ -1,0 +1,187 @@
+"""A robot's drive: from the recording of its camera to a GeoPackage of its track."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import pyogrio
+
+from vinemap.crs import WGS84, metric_crs
+from vinemap.errors import InputError, OutputError
+from vinemap.evaluate import read_lines
+from vinemap.frames import read_recording
+from vinemap.odometry import ANGLES
+from vinemap.track import follow
+from vinemap.track_table import NOWHERE, beside_rows, track_layers
+from vinemap.vector import TRACK_LAYERS, write_geopackage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    import geopandas as gpd
+    from pyproj import CRS
+
+    from vinemap.camera import Camera
+    from vinemap.crs import Start
+    from vinemap.frames import Frame
+    from vinemap.odometry import Method
+    from vinemap.track import Fix
+
+STAGES = ("Following the robot", "Placing its track", "Writing")
+
+
+class DriveSummary(NamedTuple):
+    """What became of a recording."""
+
+    out: Path
+    n_frames: int
+    n_missing: int
+    """Frames that the recording announces and doesn't have."""
+    flags: dict[str, int]
+    """How many poses have each flag."""
+    length_m: float
+    n_stretches: int
+
+    def line(self) -> str:
+        """The same in one line."""
+        said = [f"{self.out}: {self.length_m:.2f} m in {self.n_frames} frames"]
+        if self.n_missing:
+            said.append(f"the recording promises {self.n_missing} more")
+        if self.flags:
+            reasons = ", ".join(f"{count} {flag}" for flag, count in sorted(self.flags.items()))
+            said.append(f"{sum(self.flags.values())} flagged ({reasons})")
+        if self.n_stretches > 1:
+            said.append(f"in {self.n_stretches} stretches that nothing joins")
+        return "; ".join(said)
+
+
+def map_drive(
+    recording: Sequence[Path],
+    out: Path,
+    *,
+    camera: Camera,
+    start: Start | None = None,
+    rows: Path | None = None,
+    template_share: float = 0.2,
+    angles: tuple[float, float] = ANGLES,
+    method: Method = "aligned",
+    show: Callable[[Iterable[Frame], int], Iterable[Frame]] = lambda frames, _: frames,
+    step: Callable[..., Any] = lambda _, function, *args: function(*args),
+) -> DriveSummary:
+    """Follow a robot through a recording and write its track.
+
+    Parameters
+    ----------
+    recording : sequence of Path
+        Images, folders of images, and videos: see :func:`vinemap.frames.read_recording`.
+    out : Path
+        GeoPackage to write, in place of an earlier track.
+    camera, template_share, angles, method
+        As for :func:`vinemap.odometry.estimate_motion`.
+    start : Start, optional
+        Where the first frame was taken; without it the track has no place on the map.
+    rows : Path, optional
+        Vine rows, for the distance to the nearest one; the track is in their CRS if that is metric. Wants a start.
+    show : callable
+        Is given the frames and their number, and gives them on: progress.
+    step : callable
+        Is given each stage's name of ``STAGES``, its function and that one's arguments, and calls it.
+
+    Raises
+    ------
+    InputError
+        If a path holds no frames, or fewer than two can be used, or the rows can't be.
+    OutputError
+        If the GeoPackage can't be written, or the file there holds something else.
+    """
+    _check_out(out, rows)
+    if rows and not start:
+        raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
+    lines = read_lines(rows) if rows else None
+    crs = _crs_of(start, lines)
+    source = read_recording(recording, camera=camera)
+
+    def followed() -> list[Fix]:
+        frames = show(source.frames, source.n_frames)
+        return list(follow(frames, camera=camera, template_share=template_share, angles=angles, method=method))
+
+    def placed(fixes: list[Fix]) -> dict[str, gpd.GeoDataFrame]:
+        layers = track_layers(fixes, start=start, crs=crs)
+        if lines is None:
+            return layers
+        return layers | {"poses": beside_rows(layers["poses"], lines)}
+
+    fixes = step(STAGES[0], followed)
+    _check_fixes(fixes, recording, camera)
+    layers = step(STAGES[1], placed, fixes)
+    step(STAGES[2], _write, layers, out)
+    flags = [fix.flag for fix in fixes if fix.flag]
+    return DriveSummary(
+        out,
+        n_frames=len(fixes),
+        n_missing=max(0, source.n_frames - len(fixes)),
+        flags={flag: flags.count(flag) for flag in set(flags)},
+        length_m=float(layers["track"]["length_m"].sum()),
+        n_stretches=len(layers["track"]),
+    )
+
+
+def _crs_of(start: Start | None, rows: gpd.GeoDataFrame | None) -> CRS:
+    """CRS of a track: the rows' if it is metric, else the UTM zone of the start."""
+    if start is None:
+        return NOWHERE
+    if rows is None:
+        return metric_crs(WGS84, start.lon, start.lat)
+    if rows.crs is None:
+        raise InputError("The rows have no CRS: save them with it, in QGIS say")
+    if len(rows) == 0:
+        return metric_crs(WGS84, start.lon, start.lat)
+    west, south, east, north = rows.total_bounds
+    return metric_crs(rows.crs, (west + east) / 2, (south + north) / 2)
+
+
+def _check_fixes(fixes: Sequence[Fix], recording: Sequence[Path], camera: Camera) -> None:
+    """Raise InputError if less than two frames could be used."""
+    name = recording[0]
+    used = [fix for fix in fixes if fix.flag not in ("unreadable", "size")]
+    if len(used) > 1:
+        return
+    if len(fixes) == 1:
+        raise InputError(f"{name}: one frame alone shows no movement: give two at least")
+    wrong = sum(fix.flag == "size" for fix in fixes)
+    if wrong:
+        raise InputError(
+            f"{name}: {wrong} of {len(fixes)} frames don't have the camera's {camera.width} × {camera.height} pixels: "
+            "give the camera file of these frames"
+        )
+    raise InputError(f"{name}: {len(fixes) - len(used)} of {len(fixes)} frames can't be read: give two at least")
+
+
+def _check_out(out: Path, rows: Path | None) -> None:
+    """Raise OutputError where a track would be written over something else, or can't be written."""
+    if out.suffix.lower() != ".gpkg" or "!" in str(out):
+        raise OutputError(f"{out}: a track is a GeoPackage: give a name that ends in .gpkg, without '!'")
+    if not out.parent.is_dir():
+        raise OutputError(f"{out}: its folder isn't there: make it first")
+    if rows and out.exists() and rows.exists() and out.samefile(rows):
+        raise OutputError(f"{out}: holds the rows: choose another file for the track")
+    if out.exists():
+        try:
+            others = {str(name) for name, _ in pyogrio.list_layers(out)} - {*TRACK_LAYERS, "layer_styles"}
+        except Exception as error:  # GDAL's errors come in several classes
+            raise OutputError(f"{out}: is there, and isn't a track: choose another file") from error
+        if others:
+            raise OutputError(f"{out}: holds other layers ({', '.join(sorted(others))}): choose another file")
+
+
+def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:
+    draft = out.with_name(f".{out.name}.part.gpkg")
+    try:
+        draft.unlink(missing_ok=True)
+        write_geopackage(layers, draft, contract=TRACK_LAYERS)
+        draft.replace(out)
+    except OSError as error:
+        raise OutputError(f"{out}: can't be written ({error.strerror or error}): choose another file") from error
+    finally:
+        draft.unlink(missing_ok=True)

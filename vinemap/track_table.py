@@ -1,0 +1,144 @@
+"""Poses of a robot as layers: where they lie on the map, the lines of the track, and the vine row beside each."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+from pyproj import CRS
+
+from vinemap.crs import Origin, from_wgs84, main_to_wgs84, project
+from vinemap.errors import InputError
+from vinemap.poses import Pose, onward
+from vinemap.track import stretches
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from vinemap.crs import Start
+    from vinemap.track import Fix
+
+NOWHERE = CRS.from_wkt(
+    'ENGCRS["Track: metres to the right of its start and ahead",EDATUM["start of the track"],CS[Cartesian,2],'
+    'AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+)
+"""CRS of a track whose start isn't known."""
+DATED = 1e8
+"""Seconds from which on a time counts from 1970."""
+FARTHEST = 2000.0
+"""Metres between a start and the nearest row from which on one of them must be wrong."""
+
+
+def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
+    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.vector.TRACK_LAYERS`, without rows.
+
+    Parameters
+    ----------
+    fixes : sequence of Fix
+        In order, the first measured one at the start.
+    start : Start, optional
+        Without it the track starts northward at the origin of :data:`NOWHERE`.
+    crs : CRS
+        Projected CRS of the layers.
+    """
+    first = Pose(0.0, 0.0, 90.0 - (start.heading_deg if start else 0.0))
+    east, north, heading = np.array([onward(first, fix.pose) for fix in fixes]).T
+    east, north = east / 1000, north / 1000
+    xy, lat, lon = _on_the_map(east, north, start, crs)
+    seconds = np.array([np.nan if fix.time is None else fix.time for fix in fixes])
+    dated = np.where(seconds > DATED, seconds, np.nan)
+    known = seconds[np.isfinite(seconds)]
+    poses = gpd.GeoDataFrame(
+        {
+            "pose": np.arange(1, len(fixes) + 1),
+            "frame": [fix.frame for fix in fixes],
+            "time": pd.to_datetime(pd.Series(dated), unit="s", utc=True),
+            "seconds": seconds - (known[0] if len(known) else 0.0),
+            "x_m": east,
+            "y_m": north,
+            "heading_deg": (90.0 - heading) % 360,
+            "lat": lat,
+            "lon": lon,
+            "score": [fix.score for fix in fixes],
+            "agreement": [fix.agreement for fix in fixes],
+            "overlap": [fix.overlap for fix in fixes],
+            "flag": [fix.flag for fix in fixes],
+            "measured_from": [0 if fix.measured_from is None else fix.measured_from + 1 for fix in fixes],
+            "stretch": stretches(fixes),
+            "row": "",
+            "row_distance_m": np.nan,
+            "row_position_m": np.nan,
+        },
+        geometry=shapely.points(xy),
+        crs=crs,
+    )
+    return {"track": _lines(poses), "poses": poses}
+
+
+def beside_rows(poses: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Poses with the nearest row, their distance from it, and how far along it they are, in metres and in plan.
+
+    Parameters
+    ----------
+    poses : GeoDataFrame
+        Points in a projected CRS in metres.
+    rows : GeoDataFrame
+        Lines in any CRS, named by ``label`` or ``row_id``, else by their order.
+
+    Raises
+    ------
+    InputError
+        If the first pose lies kilometres from all rows, or there are none.
+    """
+    rows = rows[rows.geometry.notna() & ~rows.geometry.is_empty]
+    lines = np.atleast_1d(np.asarray(project(rows.geometry.to_numpy(), rows.crs, poses.crs)))
+    if len(lines) == 0:
+        raise InputError("The rows to measure distances from are none: give a GeoPackage with vine rows")
+    points = poses.geometry.to_numpy()
+    nearest = shapely.STRtree(lines).query_nearest(points, all_matches=False)[1]
+    distance = np.asarray(shapely.distance(points, lines[nearest]))
+    if distance[0] > FARTHEST:
+        raise InputError(
+            f"The start lies {distance[0] / 1000:.0f} km from the nearest row: give it as latitude, longitude, heading"
+        )
+    column = next((name for name in ("label", "row_id") if name in rows), None)
+    names = rows[column].astype(str).to_numpy() if column else np.arange(1, len(rows) + 1).astype(str)
+    along = shapely.line_locate_point(shapely.line_merge(lines[nearest]), points)
+    return poses.assign(row=names[nearest], row_distance_m=distance, row_position_m=along)
+
+
+def _on_the_map(
+    east: NDArray[np.float64], north: NDArray[np.float64], start: Start | None, crs: CRS
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates (n, 2) in the CRS, latitudes and longitudes (n,) of places about the start."""
+    if start is None:
+        nothing = np.full(len(east), np.nan)
+        return np.column_stack([east, north]), nothing, nothing
+    places = np.column_stack([east, north, np.zeros(len(east))])
+    geographic = main_to_wgs84(places, Origin(start.lat, start.lon, 0.0))
+    return from_wgs84(geographic, crs)[:, :2], geographic[:, 0], geographic[:, 1]
+
+
+def _lines(poses: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """A line for each unbroken stretch of measured poses."""
+    records = []
+    for number, group in poses[poses["stretch"] > 0].groupby("stretch"):
+        spread = group["seconds"].max() - group["seconds"].min()
+        steps = group["score"][group["measured_from"] > 0]
+        course = np.hypot(*np.diff(group[["x_m", "y_m"]].to_numpy(), axis=0).T)
+        records.append((number, len(group), course.sum(), spread, steps.mean(), shapely.linestrings(_xy(group))))
+    columns = ["stretch", "n_poses", "length_m", "seconds", "score", "geometry"]
+    return gpd.GeoDataFrame(pd.DataFrame(records, columns=columns), geometry="geometry", crs=poses.crs)
+
+
+def _xy(poses: gpd.GeoDataFrame) -> NDArray[np.float64]:
+    """Places (n, 2), two at least, without those at which the robot stood still."""
+    xy = shapely.get_coordinates(poses.geometry.to_numpy())
+    kept = [next(group) for _, group in groupby(range(len(xy)), key=lambda k: tuple(xy[k]))]
+    return xy[kept] if len(kept) > 1 else xy[:2]
