@@ -69,6 +69,7 @@ MAY_IMPORT = {
     **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
     "scenes": BASE | {"synthetic"},
     "virtual_camera": {"errors", "camera", "poses"},
+    "virtual_drive": {"cli", "paths", "poses", "virtual_camera"},
     "odometry_accuracy": {"camera", "poses", "odometry", "virtual_camera", "tables", "paths"},
     "settings": set(),
     "config": BASE | {"camera", "settings", "paths"},

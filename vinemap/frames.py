@@ -203,7 +203,7 @@ def _exif_time(path: Path) -> float | None:
     except rasterio.errors.RasterioIOError:
         return None
     date = tags.get("EXIF_DateTimeOriginal") or tags.get("EXIF_DateTime") or tags.get("TIFFTAG_DATETIME") or ""
-    return time_of(f"{date}.{tags.get('EXIF_SubSecTimeOriginal', '').strip() or 0}".replace(":", ""))
+    return time_of(f"{date}.{tags.get('EXIF_SubSecTime_Original', '').strip() or 0}".replace(":", ""))
 
 
 def _video(path: Path) -> Iterator[Frame]:

@@ -103,6 +103,16 @@ def classified_cloud(folder: Path, parcel: str) -> Path:
     return folder / f"{parcel}_classified.laz"
 
 
+def drive_frames(folder: Path) -> Path:
+    """Folder of the frames of a robot's drive."""
+    return folder / "frames"
+
+
+def drive_camera(folder: Path) -> Path:
+    """File of the camera that took them."""
+    return folder / "camera.yaml"
+
+
 def track(folder: Path, drive: str) -> Path:
     """GeoPackage of a robot's track."""
     return folder / f"{drive}_track.gpkg"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap.odometry import ANGLES, LEAST_CONTRAST, expected_overlap, motion_between, view_of
@@ -127,8 +128,8 @@ def stretches(fixes: Iterable[Fix]) -> list[int]:
     roots: list[int] = []
     for number, fix in enumerate(fixes):
         roots.append(number if fix.measured_from is None else roots[fix.measured_from])
-    counts = {root: roots.count(root) for root in set(roots)}
-    known = {root: k for k, root in enumerate((r for r in sorted(counts) if counts[r] > 1), start=1)}
+    counts = Counter(roots)
+    known = {root: k for k, root in enumerate((r for r in counts if counts[r] > 1), start=1)}
     return [known.get(root, 0) for root in roots]
 
 

@@ -1,0 +1,188 @@
+"""Recordings: folders of images and videos, their order, their times, and what is wrong with some of them."""
+
+import cv2
+import numpy as np
+import pytest
+from drives import ground, images, poses
+
+from vinemap.camera import Camera
+from vinemap.errors import InputError
+from vinemap.frames import read_recording, time_of
+from vinemap.odometry import estimate_motion
+from vinemap.poses import moved
+from vinemap.virtual_camera import LOW, Weather, render
+
+N = 6
+NUMBERS = (1, 2, 9, 10, 11, 100)
+
+
+@pytest.fixture(scope="module")
+def shots():
+    return images(poses(N))
+
+
+def save(folder, named):
+    folder.mkdir(exist_ok=True)
+    for name, image in named.items():
+        assert cv2.imwrite(str(folder / name), image)
+    return folder
+
+
+def read(*paths, camera=LOW):
+    recording = read_recording(paths, camera=camera)
+    return list(recording.frames), recording.n_frames
+
+
+def test_images_come_in_the_order_of_their_numbers(tmp_path, shots):
+    folder = save(tmp_path / "a", {f"frame{k}.png": shot for k, shot in zip(NUMBERS, shots, strict=True)})
+    (folder / "notes.txt").write_text("not a frame")
+    (folder / ".hidden.png").write_bytes(b"")
+    frames, count = read(folder)
+    assert count == N
+    assert [frame.name for frame in frames] == [f"frame{k}.png" for k in NUMBERS]
+    assert all(np.array_equal(frame.image, shot) for frame, shot in zip(frames, shots, strict=True))
+    assert {frame.time for frame in frames} == {None}
+
+
+def test_parts_follow_each_other(tmp_path, shots):
+    one = save(tmp_path / "z", {"1.png": shots[0], "2.png": shots[1]})
+    two = save(tmp_path / "a", {"1.png": shots[2]})
+    frames, count = read(one, two, one / "2.png")
+    assert [frame.name for frame in frames] == ["1.png", "2.png", "1.png", "2.png"]
+    assert count == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds"),
+    [
+        ("1778745600", 1778745600),
+        ("1778745600.25", 1778745600.25),
+        ("cam0_1778745600250", 1778745600.25),
+        ("1778745600250000", 1778745600.25),
+        ("1778745600250000000", 1778745600.25),
+        ("20260514T080000", 1778745600),
+        ("IMG_20260514_080000_250", 1778745600.25),
+        ("2026-05-14T08:00:00.5", 1778745600.5),
+        ("frame_000123", None),
+        ("20261399_080000", None),
+        ("20260514", None),
+        ("123456789012", None),
+    ],
+)
+def test_times_in_names(name, seconds):
+    assert time_of(name) == (pytest.approx(seconds, abs=1e-3) if seconds else None)
+
+
+def test_a_time_in_the_image(tmp_path, shots):
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x9003: "2026:05:14 08:00:00", 0x9291: "25"})
+    path = tmp_path / "DSC_7.jpg"
+    Image.fromarray(shots[0]).save(path, exif=exif)
+    (frame,), _ = read(path)
+    assert frame.time == pytest.approx(1778745600.25, abs=1e-3)
+
+
+def test_colour_and_16_bits_are_as_good_as_grey(tmp_path, shots):
+    colour = cv2.cvtColor(shots[0], cv2.COLOR_GRAY2BGR)
+    deep = shots[1].astype(np.uint16) * 16  # as of a sensor of 12 bits
+    alpha = cv2.cvtColor(shots[2], cv2.COLOR_GRAY2BGRA)
+    frames, _ = read(save(tmp_path / "a", {"1.png": colour, "2.png": deep, "3.png": alpha, "4.tif": deep * 16}))
+    assert all(frame.image.dtype == np.uint8 and frame.image.shape == (240, 320) for frame in frames)
+    assert np.abs(frames[0].image.astype(int) - shots[0]).max() <= 1
+    assert np.corrcoef(frames[1].image.ravel(), shots[1].ravel())[0, 1] > 0.999
+    assert frames[1].image.std() > 0.5 * shots[1].std()
+    assert np.array_equal(frames[3].image, shots[1])
+
+
+def test_flaws_are_told_frame_by_frame(tmp_path, shots):
+    folder = save(tmp_path / "a", {f"{k}.png": shot for k, shot in enumerate(shots)})
+    save(folder, {"6.jpg": shots[0], "7.jpg": shots[0]})
+    save(folder, {"1.png": np.zeros((480, 640), np.uint8), "8.tif": shots[0].astype(np.float32)})
+    for name in ("2.png", "6.jpg"):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: len(data) // 2])  # decoders would make up the rest
+    (folder / "3.png").write_bytes(b"")
+    (folder / "4.png").write_bytes(b"IEND" * 100)
+    frames, _ = read(folder)
+    assert [frame.flaw for frame in frames] == ["", "size", "unreadable", "unreadable", "unreadable", ""] + [
+        "unreadable",
+        "",
+        "unreadable",
+    ]
+    assert [frame.image is None for frame in frames] == [frame.flaw != "" for frame in frames]
+
+
+def write_video(path, shots, *, codec="MJPG", rate=10):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, (320, 240))
+    for shot in shots:
+        writer.write(cv2.cvtColor(shot, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def test_a_video(tmp_path, shots):
+    path = write_video(tmp_path / "a.avi", shots)
+    frames, count = read(path, path)
+    assert count == len(frames) == 2 * N
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(2 * N) / 10, abs=1e-3)
+    assert frames[1].name == "a.avi 2"
+    assert np.corrcoef(frames[1].image.ravel(), shots[1].ravel())[0, 1] > 0.98
+
+
+def test_a_video_that_ends_early(tmp_path, shots, capfd):
+    path = write_video(tmp_path / "a.avi", shots * 4)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    frames, count = read(path)
+    assert count == 4 * N
+    assert 2 * N - 3 < len(frames) < 2 * N + 3
+    assert not any(frame.flaw for frame in frames)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_video_with_damage_within_goes_on_behind_it(tmp_path, shots):
+    path = write_video(tmp_path / "a.avi", shots * 4)
+    data = bytearray(path.read_bytes())
+    starts = [k for k in range(len(data)) if data[k : k + 4] == b"00dc" and data[k + 8 : k + 10] == b"\xff\xd8"]
+    assert len(starts) == 4 * N
+    data[starts[9] + 8 : starts[10]] = bytes(starts[10] - starts[9] - 8)
+    path.write_bytes(data)
+    frames, _ = read(path)
+    assert [k for k, frame in enumerate(frames) if frame.flaw] == [9]
+    assert len(frames) == 4 * N
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda path: path, "no such file or folder"),
+        (lambda path: path.mkdir(), "holds no images"),
+        (lambda path: path.write_text("a,b"), "neither an image nor a video"),
+    ],
+)
+def test_what_holds_no_frames(tmp_path, make, says):
+    make(tmp_path / "a")
+    with pytest.raises(InputError, match=says):
+        read_recording([tmp_path / "a"], camera=LOW)
+
+
+def test_what_is_no_video(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"nothing" * 1000)
+    with pytest.raises(InputError, match="can't be read as a video"):
+        read_recording([tmp_path / "a.mp4"], camera=LOW)
+
+
+def test_the_lens_is_taken_out(tmp_path):
+    """A step seen by a lens that bends by some pixels is measured as if it were a pinhole."""
+    lens = Camera(**LOW.model_dump() | {"distortion": [-0.25, 0.08, 0.001, -0.001, 0.0]})
+    robot, laid = poses(2, step=55, turn=2, x=-1000), ground()
+    bent = [render(laid, pose, camera=lens, weather=Weather(2, 0.02), seed=k) for k, pose in enumerate(robot)]
+    frames, _ = read(save(tmp_path / "a", {f"{k}.png": image for k, image in enumerate(bent)}), camera=lens)
+    truth, errors = moved(*robot), []
+    for pair in (bent, [frame.image for frame in frames]):
+        motion = estimate_motion(*pair, camera=LOW)
+        errors.append(np.hypot(motion.dx_mm - truth.x_mm, motion.dy_mm - truth.y_mm))
+    assert errors[1] < 0.4
+    assert errors[0] > 4 * errors[1]
