@@ -1,0 +1,252 @@
+"""A drive from its recording to the GeoPackage, as a user makes it."""
+
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import geopandas as gpd
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from drives import images, poses
+from pyproj import Geod
+
+from vinemap.camera import Camera
+from vinemap.crs import Start
+from vinemap.drive import map_drive
+from vinemap.errors import InputError, OutputError
+from vinemap.poses import moved
+from vinemap.vector import TRACK_LAYERS
+from vinemap.virtual_camera import LOW
+
+N = 12
+START = Start(44.61167, 7.92442, 72.5)
+FILE = "\n".join(f"{key}: {value}" for key, value in LOW.model_dump(exclude_defaults=True).items())
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return poses(N, turn=2)
+
+
+@pytest.fixture(scope="module")
+def recording(robot, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    for k, image in enumerate(images(robot)):
+        cv2.imwrite(str(folder / f"{1778745600 + k / 4:.2f}.png"), image)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory):
+    """Two rows 2.5 m apart, the start 1 m to the right of the first, in Gauss–Boaga: not the track's own CRS."""
+    geod, lines = Geod(ellps="WGS84"), []
+    for left in (1.0, -1.5):
+        ends = []
+        for along in (-10.0, 20.0):
+            lon, lat, _ = geod.fwd(START.lon, START.lat, START.heading_deg, along)
+            ends.append(geod.fwd(lon, lat, START.heading_deg - 90, left)[:2])
+        lines.append(shapely.LineString(ends))
+    frame = gpd.GeoDataFrame({"label": ["7 F", "8 F"]}, geometry=lines, crs=4326)
+    path = tmp_path_factory.mktemp("rows") / "rows.gpkg"
+    frame.to_crs(3003).to_file(path, layer="rows")
+    return path
+
+
+def test_a_track_lies_where_the_robot_drove(recording, robot, rows, tmp_path):
+    out = tmp_path / "track.gpkg"
+    summary = map_drive([recording], out, camera=LOW, start=START, rows=rows)
+    length = sum(np.hypot(*moved(*pair)[:2]) for pair in pairwise(robot)) / 1000
+    assert summary.line() == f"{out}: {length:.2f} m in {N} frames"
+    found = gpd.read_file(out, layer="poses")
+    assert found.crs.to_epsg() == 3003
+    geod = Geod(ellps="WGS84")
+    for true, pose in zip(robot, found.itertuples(), strict=True):
+        known = moved(robot[0], true)
+        away = np.degrees(np.arctan2(known.y_mm, known.x_mm))
+        lon, lat, _ = geod.fwd(START.lon, START.lat, START.heading_deg - away, np.hypot(*known[:2]) / 1000)
+        assert abs(geod.inv(lon, lat, pose.lon, pose.lat)[2]) < 0.001
+        assert pose.heading_deg == pytest.approx((START.heading_deg - known.heading_deg) % 360, abs=0.06)
+        assert np.hypot(pose.x_m, pose.y_m) * 1000 == pytest.approx(np.hypot(*known[:2]), abs=0.8)
+        assert pose.row == "7 F"
+        assert pose.row_distance_m == pytest.approx(1 - known.y_mm / 1000, abs=0.003)
+        assert pose.row_position_m == pytest.approx(10 + known.x_mm / 1000, abs=0.01)
+    on_the_map = found.to_crs(4326).geometry
+    assert on_the_map.y.to_numpy() == pytest.approx(found["lat"].to_numpy(), abs=1e-8)
+    assert (found["time"].dt.tz_convert("UTC") - found["time"].iloc[0]).dt.total_seconds().tolist() == list(
+        np.arange(N) / 4
+    )
+    assert found["time"].iloc[0].isoformat() == "2026-05-14T08:00:00+00:00"
+    track = gpd.read_file(out, layer="track")
+    assert len(track) == 1
+    assert track.geometry[0].length == pytest.approx(track["length_m"][0], rel=5e-4)
+    assert track["seconds"][0] == pytest.approx((N - 1) / 4)
+
+
+def test_a_track_without_a_start_goes_north_from_nothing(recording, robot, tmp_path):
+    out = tmp_path / "track.gpkg"
+    map_drive([recording], out, camera=LOW)
+    found = gpd.read_file(out, layer="poses")
+    end = moved(robot[0], robot[-1])
+    assert (found["x_m"].iloc[-1], found["y_m"].iloc[-1]) == pytest.approx(
+        (-end.y_mm / 1000, end.x_mm / 1000), abs=1e-3
+    )
+    assert found["lat"].isna().all()
+    assert found["row_distance_m"].isna().all()
+    assert set(found["row"]) == {""}
+    assert not (found.crs and (found.crs.is_projected or found.crs.is_geographic))
+
+
+def test_the_geopackage_keeps_its_contract(recording, tmp_path):
+    paths = [tmp_path / name for name in ("one.gpkg", "two.gpkg")]
+    for path in paths:
+        map_drive([recording], path, camera=LOW, start=START)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    layers = {str(name): str(kind) for name, kind in pyogrio.list_layers(paths[0])}
+    assert {name: layer.geometry for name, layer in TRACK_LAYERS.items()} == {
+        name: layers[name] for name in TRACK_LAYERS
+    }
+    for name, layer in TRACK_LAYERS.items():
+        assert pyogrio.read_info(paths[0], layer=name)["fields"].tolist() == list(layer.columns)
+    map_drive([recording], paths[0], camera=LOW, start=START)  # in place of an earlier track
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.gpkg", "two.gpkg"]
+
+
+def test_lost_steps_break_the_line_and_are_told(recording, tmp_path):
+    shots = sorted(recording.iterdir())
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG")
+    black = tmp_path / "black.png"
+    cv2.imwrite(str(black), np.zeros((240, 320), np.uint8))
+    order = [*shots[:4], tmp_path / "broken.png", *shots[5:8], black, shots[0], *shots[1:4]]
+    summary = map_drive(order, tmp_path / "track.gpkg", camera=LOW, start=START)
+    assert summary.n_stretches == 2
+    assert "1 blank" in summary.line()
+    assert "1 unreadable" in summary.line()
+    found = gpd.read_file(tmp_path / "track.gpkg", layer="poses")
+    assert found["flag"].tolist()[4] == "unreadable"
+    assert found["flag"].tolist()[8] == "blank"
+    assert found["flag"].tolist()[9] != ""
+    assert found["stretch"].tolist() == [1] * 4 + [0] + [1] * 3 + [0] + [2] * 4
+    lines = gpd.read_file(tmp_path / "track.gpkg", layer="track")
+    assert [len(line.coords) for line in lines.geometry] == [7, 4]
+
+
+def other_size(folder):
+    for k in range(3):
+        cv2.imwrite(str(folder / f"{k}.png"), np.zeros((480, 640), np.uint8))
+
+
+def one_frame(folder):
+    cv2.imwrite(str(folder / "1.png"), np.full((240, 320), 90, np.uint8))
+
+
+def broken(folder):
+    for k in range(3):
+        (folder / f"{k}.png").write_bytes(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (one_frame, "one frame alone shows no movement: give two at least"),
+        (other_size, "3 of 3 frames don't have the camera's 320 × 240 pixels"),
+        (broken, "3 of 3 frames can't be read"),
+    ],
+)
+def test_too_few_frames_leave_nothing(make, says, tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    make(folder)
+    with pytest.raises(InputError, match=says):
+        map_drive([folder], tmp_path / "track.gpkg", camera=LOW)
+    assert not list(tmp_path.glob("*.gpkg"))
+
+
+def test_what_is_there_stays(recording, rows, tmp_path):
+    (tmp_path / "text.gpkg").write_text("mine")
+    for out, says in [
+        (rows, "holds"),
+        (tmp_path / "text.gpkg", "isn't a track"),
+        (tmp_path / "track.shp", "ends in .gpkg"),
+        (tmp_path / "nowhere" / "track.gpkg", "its folder isn't there"),
+    ]:
+        with pytest.raises(OutputError, match=says):
+            map_drive([recording], out, camera=LOW, start=START, rows=rows)
+    assert (tmp_path / "text.gpkg").read_text() == "mine"
+    assert len(gpd.read_file(rows, layer="rows")) == 2
+
+
+def test_a_start_elsewhere_is_told(recording, rows, tmp_path):
+    with pytest.raises(InputError, match="km from the nearest row: give it as latitude, longitude"):
+        map_drive([recording], tmp_path / "a.gpkg", camera=LOW, start=Start(7.92442, 44.61167, 0), rows=rows)
+    with pytest.raises(InputError, match="need a start"):
+        map_drive([recording], tmp_path / "a.gpkg", camera=LOW, rows=rows)
+
+
+def vinemap(folder, *args):
+    command = [sys.executable, "-c", "from vinemap.cli import main; main()", *map(str, args)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_the_command(recording, rows, tmp_path):
+    (tmp_path / "camera.yaml").write_text(FILE)
+    args = ("track", recording, "--camera", "camera.yaml", "--rows", rows)
+    done = vinemap(tmp_path, *args, "--start", "44.61167,7.92442,72.5", "--method", "quadratic")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("track.gpkg: 0.4")
+    assert set(gpd.read_file(tmp_path / "track.gpkg", layer="poses")["row"]) == {"7 F"}
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--start", "44.6,7.9"], "isn't latitude, longitude and heading"),
+        (["--start", "144.6,7.9,10"], "lies nowhere"),
+        (["--start", "44.6,7.9,nan"], "clockwise from north"),
+        (["--template-share", "0.01"], "makes a template of 3 pixels of 240"),
+        (["--template-share", "0"], "0"),
+        (["--camera", "other.yaml"], "other.yaml: no such file"),
+        (["--camera", "bad.yaml"], "bad.yaml: fx is missing"),
+        (["nothing"], "nothing: no such file or folder"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(recording, tmp_path, args, says):
+    (tmp_path / "camera.yaml").write_text(FILE)
+    (tmp_path / "bad.yaml").write_text(FILE.replace("fx:", "#"))
+    done = vinemap(tmp_path, "track", recording, "--camera", "camera.yaml", *args)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "track.gpkg").exists()
+
+
+def test_drives_in_one_job(recording, tmp_path):
+    """A drive that fails costs no other; each stage is a task run."""
+    (tmp_path / "camera.yaml").write_text(FILE)
+    (tmp_path / "drives.yaml").write_text(
+        f"camera: camera.yaml\nout: tracks\ndrives:\n  bad: {{frames: [nothing]}}\n"
+        f"  good: {{frames: ['{recording}'], start: [44.61167, 7.92442, 72.5]}}\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
+    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-m", "flows.odometry", "drives.yaml"]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300, env=environment
+    )
+    assert done.returncode == 1
+    assert done.stdout.startswith(f"{Path('tracks') / 'good_track.gpkg'}: 0.4")
+    assert done.stderr == "vinemap: bad: nothing: no such file or folder: give images, folders of images, or videos\n"
+    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["good_track.gpkg"]
+
+
+def test_another_camera_than_the_files_is_seen(recording, tmp_path):
+    with pytest.raises(InputError, match="the camera's 640 × 480"):
+        map_drive(
+            [recording],
+            tmp_path / "a.gpkg",
+            camera=Camera(**LOW.model_dump() | {"width": 640, "height": 480, "fx": 600.0, "fy": 600.0}),
+        )
