@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from vinemap.cli import commands
+from vinemap.config import load_camera, load_drives
 from vinemap.template import template
-from vinemap.vector import LAYERS
+from vinemap.vector import LAYERS, TRACK_LAYERS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -41,11 +42,21 @@ def test_commands_exist(page):
         assert set(re.findall(r"--[a-z-]+", line.split("#")[0])) <= options
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_every_column_is_described(layer):
-    section = re.search(rf"### Layer `{layer}`.*?(?=\n##|\Z)", text("products.md"), re.DOTALL)[0]
+@pytest.mark.parametrize(
+    ("page", "layer"), [*(("products.md", name) for name in LAYERS), *(("track.md", name) for name in TRACK_LAYERS)]
+)
+def test_every_column_is_described(page, layer):
+    section = re.search(rf"### Layer `{layer}`.*?(?=\n##|\Z)", text(page), re.DOTALL)[0]
     firsts = [line.split("|")[1] for line in section.splitlines() if line.startswith("|")]
-    assert set(re.findall(r"`(\w+)`", " ".join(firsts))) == set(LAYERS[layer].columns)
+    assert set(re.findall(r"`(\w+)`", " ".join(firsts))) == set((LAYERS | TRACK_LAYERS)[layer].columns)
+
+
+def test_the_camera_of_the_docs_is_one(tmp_path):
+    found = re.findall(r"```yaml\n(.*?)```", text("track.md"), re.DOTALL)
+    for name, body in zip(("camera.yaml", "drives.yaml"), found, strict=True):
+        (tmp_path / name).write_text(body)
+    assert load_camera(tmp_path / "camera.yaml").turned_deg == -90
+    assert list(load_drives(tmp_path / "drives.yaml").drives) == ["monday", "tuesday"]
 
 
 def test_every_key_is_described():

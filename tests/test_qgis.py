@@ -9,10 +9,16 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from drives import images, poses
 
+from vinemap.crs import Start
+from vinemap.drive import map_drive
 from vinemap.parcel import map_parcel
 from vinemap.synthetic import write_survey
+from vinemap.virtual_camera import LOW
 
 OPEN = Path(__file__).with_name("open_in_qgis.py")
 PICTURES = Path(__file__).parents[1] / "build" / "qgis"
@@ -122,3 +128,22 @@ def test_a_raster_alone_finds_its_colours(open_in_qgis, product):
     seen = open_in_qgis(product / "Clos & Fils #3_chm.tif", "chm")
     assert seen["layers"][0]["renderer"] == "singlebandpseudocolor"
     assert seen["layers"][0]["valid"]
+
+
+def test_a_track_opens_beside_the_rows(open_in_qgis, tmp_path):
+    recording = tmp_path / "frames"
+    recording.mkdir()
+    shots = [*images(poses(8)), np.zeros((240, 320), np.uint8)]
+    for k, image in enumerate(shots):
+        cv2.imwrite(str(recording / f"{k}.png"), image)
+    for name, start in {"placed": Start(44.61167, 7.92442, 72.5), "nowhere": None}.items():
+        map_drive([recording], tmp_path / f"{name}.gpkg", camera=LOW, start=start)
+        seen = open_in_qgis(tmp_path / f"{name}.gpkg", f"track_{name}")
+        assert seen["errors"] == []
+        assert seen["crs"] == ("EPSG:32632" if start else "")
+        layers = {layer["name"]: layer for layer in seen["layers"]}
+        assert set(layers) == {"track", "poses"}
+        assert all(layer["valid"] and layer["styled"] and layer["about"] for layer in layers.values())
+        assert [c["label"] for c in layers["poses"]["classes"]] == ["measured", "flagged"]
+        assert layers["poses"]["aliases"]["heading_deg"] == "Heading, clockwise from north (°)"
+        assert layers["poses"]["n"] == 9

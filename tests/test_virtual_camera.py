@@ -100,3 +100,18 @@ def test_weather_is_as_told():
 def test_the_edge_of_the_ground_is_no_ground():
     with pytest.raises(ValueError, match="beyond the ground"):
         render(dot(0, 0), Pose(0, 0, 0))
+
+
+def test_a_recording_to_try_things_on(tmp_path):
+    from vinemap.config import load_camera
+    from vinemap.frames import read_recording
+    from vinemap.virtual_drive import BEGUN, record
+
+    robot = [Pose(k * 30.0 - 950, 0, 0) for k in range(3)]
+    laid = lay_ground("soil", size_mm=(600, 500))
+    record(tmp_path, laid, robot)
+    camera = load_camera(tmp_path / "camera.yaml")
+    assert camera == LOW
+    frames = list(read_recording([tmp_path / "frames"], camera=camera).frames)
+    assert [frame.time for frame in frames] == pytest.approx([BEGUN, BEGUN + 0.2, BEGUN + 0.4])
+    assert np.array_equal(frames[2].image, render(laid, robot[2], seed=2))
