@@ -207,7 +207,7 @@ def test_the_command(recording, rows, tmp_path):
         (["--start", "44.6,7.9"], "isn't latitude, longitude and heading"),
         (["--start", "144.6,7.9,10"], "lies nowhere"),
         (["--start", "44.6,7.9,nan"], "clockwise from north"),
-        (["--template-share", "0.01"], "makes a template of 3 pixels of 240"),
+        (["--template-share", "0.01"], "0.01 of 240 pixels: give a share"),
         (["--template-share", "0"], "0"),
         (["--camera", "other.yaml"], "other.yaml: no such file"),
         (["--camera", "bad.yaml"], "bad.yaml: fx is missing"),

@@ -10,7 +10,7 @@ from vinemap.errors import InputError
 from vinemap.odometry import estimate_motion
 from vinemap.odometry_accuracy import template_error
 from vinemap.poses import Pose, moved
-from vinemap.virtual_camera import LOW, Ground, Weather, lay_ground, render, rough, wander
+from vinemap.virtual_camera import HIGH, LOW, Ground, Weather, lay_ground, render, rough, wander
 
 SIZE = (1000, 1000)
 
@@ -75,6 +75,47 @@ def test_coarse_to_fine_finds_what_the_exhaustive_search_finds(walk, method):
         )
         assert template_error(quick.movement, whole.movement, LOW) < 0.003
         assert quick.rotation_deg == pytest.approx(whole.rotation_deg, abs=0.008)
+
+
+@pytest.mark.parametrize("camera", [HIGH, Camera(width=640, height=480, fx=599, fy=599, above_ground_mm=245)])
+def test_more_pixels_measure_more_finely(grounds, camera):
+    robot = [Pose(-camera.x_mm + x, y, heading) for x, y, heading in ((0, 0, 0), (61, 4, 0), (0, 0, 3))]
+    first, *others = [render(grounds["soil"], pose, camera=camera, seed=k) for k, pose in enumerate(robot)]
+    for other, pose in zip(others, robot[1:], strict=True):
+        motion, truth = estimate_motion(first, other, camera=camera), moved(robot[0], pose)
+        assert motion.flag == ""
+        assert template_error(motion.movement, truth, camera) < 0.01
+        assert motion.rotation_deg == pytest.approx(truth.heading_deg, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"template_share": 0.0}, "template_share = 0 "),
+        ({"template_share": 1.0}, "template_share = 1 "),
+        ({"template_share": 0.02}, "0.02 of 240 pixels"),
+        ({"template_share": float("nan")}, "template_share = nan"),
+        ({"angles": (9.0, -9.0)}, "from 9° to -9° hold nothing"),
+        ({"angles": (0.0, 1000.0)}, "hold nothing"),
+    ],
+)
+def test_absurd_options_are_refused(walk, options, says):
+    frame, next_frame, _ = walk["soil"][0]
+    with pytest.raises(InputError, match=says):
+        estimate_motion(frame, next_frame, camera=LOW, **options)
+
+
+def test_the_template_lies_where_both_frames_should_show_it(grounds):
+    """Steps too long for a template of the middle are measured where they are expected."""
+    robot = [Pose(x - 950, 0, heading) for x, heading in ((0, 0), (150, 2))]
+    frames = [render(grounds["gravel"], pose, seed=k) for k, pose in enumerate(robot)]
+    truth = moved(*robot)
+    assert estimate_motion(*frames, camera=LOW).flag
+    guess = Pose(truth.x_mm - 9, truth.y_mm + 6, 0.5)
+    motion = estimate_motion(*frames, camera=LOW, expected=guess)
+    assert motion.flag == ""
+    assert motion.rotation_deg == pytest.approx(2, abs=0.03)
+    assert template_error(motion.movement, truth, LOW) < 0.05
 
 
 def test_steps_on_good_ground_are_believed(walk):

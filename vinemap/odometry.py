@@ -48,10 +48,10 @@ SMOOTHING = 1.0
 """Sigma in pixels of the Gaussian that both frames get: interpolation blurs the turned template, and only that one."""
 NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95
 """n_Γ and m of Eq. 9."""
-COARSE = 4
-"""Pixels in one of the coarse search's."""
-APART = 6
-"""Pixels between two places that aren't the same."""
+COARSE_SIZE = 60
+"""Pixels along the shorter side of the coarse frames, or a little more or less."""
+APART = 1.5
+"""Pixels of the coarse frames between two places that aren't the same."""
 BACKGROUND = 4.0
 """Sigma in pixels of the coarse frames of what is taken off as uneven light."""
 TURNED = 1.2
@@ -137,7 +137,7 @@ def estimate_motion(
         aligned by the enhanced correlation coefficient, or by the quadratic alone; by the thesis's weighted centroid
         (Eq. 9–12); or not at all, on frames as they are: the standard algorithm.
     search : {"coarse to fine", "exhaustive"}
-        Whether all places and angles are tried at a quarter of the resolution first, or at the full one.
+        Whether all places and angles are tried on coarse frames of some 80 × 60 pixels first, or at full resolution.
     expected : Pose, optional
         Movement by which the template is chosen from what both frames should show; without it, it is the middle of
         the first (Eq. 3). All places of the next are searched all the same.
@@ -195,12 +195,13 @@ def motion_between(
     expected: Pose | None = None,
 ) -> Motion:
     """:func:`estimate_motion` for frames that are ready, so that each need be made so only once."""
-    half = round(template_share * min(camera.width, camera.height) / 2)
-    if not (0 < template_share < 1 and half >= SMALLEST_TEMPLATE):
+    shorter = min(camera.width, camera.height)
+    if not (2 * SMALLEST_TEMPLATE <= template_share * shorter < shorter):
         raise InputError(
-            f"template_share = {template_share:g} makes a template of {2 * half + 1} pixels of "
-            f"{min(camera.width, camera.height)}: give a share below 1 that makes {2 * SMALLEST_TEMPLATE + 1} at least"
+            f"template_share = {template_share:g} of {shorter} pixels: give a share below 1 that makes a template of "
+            f"{2 * SMALLEST_TEMPLATE} pixels at least"
         )
+    half = round(template_share * shorter / 2)
     if not (angles[0] < angles[1] <= angles[0] + 360 and max(map(abs, angles)) <= 360):
         raise InputError(f"angles from {angles[0]:g}° to {angles[1]:g}° hold nothing: give the smaller first, in ±360")
     centre = _template_centre(camera, half, expected)
@@ -216,12 +217,13 @@ def motion_between(
     )
     if min(view.contrast, next_view.contrast) < LEAST_CONTRAST:
         return _motion(camera, centre, Place(0.0, *centre), flag="blank")
-    peaks = [climb(fine, place, COARSE + 1) for place in _candidates(view, next_view, fine)]
+    n = _coarseness(view.image)
+    peaks = [climb(fine, place, n + 1) for place in _candidates(view, next_view, fine)]
     if search == "exhaustive":
         peaks.append(peak(fine, fine.whole))
     agreed = {index: _agreement(view, next_view, centre, place_at(fine, index))[0] for index, _ in peaks}
     top, score = max(peaks, key=lambda found: agreed[found[0]])
-    others = [index for index in agreed if np.hypot(index[1] - top[1], index[2] - top[2]) > APART]
+    others = [index for index in agreed if np.hypot(index[1] - top[1], index[2] - top[2]) > APART * n]
     rival = max((agreed[index] for index in others), default=0.0)
     place = _refined(fine, top, method)
     agreement, overlap = _agreement(view, next_view, centre, place)
@@ -281,19 +283,27 @@ def _motion(
     return Motion(float(dx), float(dy), place.angle, score, agreement, rival, overlap, flag)
 
 
+def _coarseness(image: Array) -> int:
+    """Pixels along the side of one of the coarse search's."""
+    shorter: int = min(image.shape)
+    return max(1, round(shorter / COARSE_SIZE))
+
+
 def _reduced(image: Array) -> Array:
     """Means of squares of pixels."""
     import cv2
 
-    height, width = (size // COARSE for size in image.shape)
-    whole = image[: height * COARSE, : width * COARSE]
+    n = _coarseness(image)
+    height, width = (size // n for size in image.shape)
+    whole = image[: height * n, : width * n]
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _candidates(view: View, next_view: View, fine: Search) -> list[Place]:
     """Where the template may be, by the coarse frames."""
-    row, column = (round((at + 0.5) / COARSE - 0.5) for at in fine.centre)
-    half = max(2, round(fine.half / COARSE))
+    n = _coarseness(view.image)
+    row, column = (round((at + 0.5) / n - 0.5) for at in fine.centre)
+    half = max(2, round(fine.half / n))
     angles = fine.whole[0][1] * fine.step, fine.whole[0][-2] * fine.step
     coarse = search_of(
         view.coarse,
@@ -305,7 +315,7 @@ def _candidates(view: View, next_view: View, fine: Search) -> list[Place]:
         cubic=False,
     )
     return [
-        Place(angle, fine.centre[0] + COARSE * (i - row), fine.centre[1] + COARSE * (j - column))
+        Place(angle, fine.centre[0] + n * (i - row), fine.centre[1] + n * (j - column))
         for angle, i, j in coarse_peaks(coarse)
     ]
 
@@ -387,7 +397,8 @@ def _agreement(view: View, next_view: View, centre: Sequence[float], place: Plac
     import cv2
 
     a, b = view.detail, next_view.detail
-    source, target = ((np.asarray(at) + 0.5) / COARSE - 0.5 for at in (centre, place[1:]))
+    n = _coarseness(view.image)
+    source, target = ((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:]))
     matrix = warp(place.angle, source, target)
     size, flags = b.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     moved = cv2.warpAffine(a, matrix, size, flags=flags)
