@@ -17,7 +17,6 @@ from vinemap import odometry_plots as plots
 from vinemap.cli import FILE, plain_errors
 from vinemap.odometry_tables import MOST_SECONDS, drift_table, loss_table, relief_table, size_table, terrain_tables
 from vinemap.odometry_trials import (
-    PATCH,
     SHARES,
     drifts,
     frames_to_time,
@@ -27,10 +26,10 @@ from vinemap.odometry_trials import (
     relief_errors,
     seconds_of,
     size_of,
-    walk,
 )
 from vinemap.tables import as_markdown, as_text, fill
 from vinemap.virtual_camera import LOW, MADE, PHOTOGRAPHS, lay_ground
+from vinemap.virtual_steps import PATCH, walk
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 from functools import partial, reduce
-from itertools import islice, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vinemap.odometry import estimate_motion
 from vinemap.poses import STILL, Pose, moved, onward
-from vinemap.virtual_camera import HIGH, LOW, above, lay_ground, render, rough, sinusoid, wander
+from vinemap.virtual_camera import HIGH, LOW, lay_ground, render, sinusoid, wander
+from vinemap.virtual_steps import ROOM, beyond, unrelated, walk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,11 +22,10 @@ if TYPE_CHECKING:
 
     from vinemap.camera import Camera
     from vinemap.odometry import Method, Strategy
-    from vinemap.virtual_camera import Ground, Image
+    from vinemap.virtual_camera import Image
+    from vinemap.virtual_steps import Step
 
     Array = NDArray[np.floating]
-    Step = tuple[Image, Image, Pose]
-    """Two frames and the true movement between them."""
     Follower = Callable[[Sequence[Image]], Pose]
     """Movement from the first frame of a path to its last."""
 
@@ -40,16 +40,8 @@ RELIEFS = ("8 mm, the truth", "25 mm, the truth", "25 mm, 1280 × 720")
 """From the lowest to the highest point, and what errors are measured against."""
 TIMED = 12
 """Frames of which pairs are timed."""
-ROOM = (1000.0, 1000.0)
-"""Millimetres of ground for robots that wander."""
-PATCH = 60
-"""Steps on one piece of ground; then another is laid."""
-HILLS = 30.0
-"""Millimetres at which the relief's correlation is 1/e."""
 FAILURE = 5.0
 """Millimetres from which on a step is wrong."""
-BEYOND = (0.3, 2.0)
-"""Frame widths between cameras that see too little of the same."""
 
 
 class Errors(NamedTuple):
@@ -125,44 +117,10 @@ def template_error(movement: Pose, truth: Pose, camera: Camera) -> float:
     return float(np.hypot(*template_offset(movement, truth, camera)))
 
 
-def steps_of(ground: Ground, poses: Sequence[Pose], *, camera: Camera = LOW, seed: int = 0) -> Iterator[Step]:
-    """Frames of the poses of a path, pair by pair, each with the true movement."""
-    frames = (render(ground, pose, camera=camera, seed=seed + k) for k, pose in enumerate(poses))
-    for pair, step in zip(pairwise(frames), pairwise(poses), strict=True):
-        yield *pair, moved(*step)
-
-
-def walk(ground: str | Path, n: int, *, relief_mm: float = 0.0, camera: Camera = LOW, seed: int = 0) -> Iterator[Step]:
-    """Random steps of up to 70 mm and 9°, from piece to piece of a ground."""
-    for k, piece in _pieces(ground, n, relief_mm, seed):
-        poses = wander(min(PATCH, n - PATCH * k) + 1, seed=seed + k)
-        yield from steps_of(piece, poses, camera=camera, seed=1000 * (seed + k))
-
-
 def referred(steps: Iterable[Step], fine: Iterable[Step]) -> Iterator[Step]:
     """Steps whose truth is what is measured in the high resolution: the thesis's reference."""
     for (frame, next_frame, _), (*pair, _) in zip(steps, fine, strict=True):
         yield frame, next_frame, estimate_motion(*pair, camera=HIGH).movement
-
-
-def unrelated(ground: str | Path, n: int, *, relief_mm: float = 0.0, seed: int = 0) -> Iterator[tuple[Image, Image]]:
-    """Two frames of different pieces of a ground."""
-    walks = (walk(ground, n, relief_mm=relief_mm, seed=s) for s in (seed, seed + 10_000))
-    for (frame, *_), (other, *_) in zip(*walks, strict=True):
-        yield frame, other
-
-
-def beyond(ground: str | Path, n: int, *, relief_mm: float = 0.0, seed: int = 0) -> Iterator[Step]:
-    """Steps as long as :data:`BEYOND`, any way, with turns of up to 9°."""
-    rng = np.random.default_rng(seed)
-    width = LOW.width * LOW.above_ground_mm / LOW.fx
-    for k, piece in _pieces(ground, n, relief_mm, seed):
-        for i in range(min(PATCH, n - PATCH * k)):
-            far, away, turn = rng.uniform(*BEYOND) * width, rng.uniform(0, 2 * np.pi), rng.uniform(-9, 9)
-            half = far / 2 * np.array([np.cos(away), np.sin(away)])
-            middle = rng.uniform(-25, 25, 2)
-            poses = above(middle - half, 0.0), above(middle + half, turn)
-            yield from steps_of(piece, poses, seed=1000 * (seed + k) + 2 * i)
 
 
 def measure(
@@ -217,12 +175,18 @@ def frames_to_time() -> dict[str, list[Image]]:
 def losses(ground: str | Path, n: int, *, relief_mm: float = 0.0, seed: int = 0) -> Losses:
     """Take so many random steps, and a fifth as many pairs of the other kinds."""
     fewer = max(n // 5, 1)
-    contrast = np.mean([frame.std() for frame, *_ in islice(walk(ground, n, relief_mm=relief_mm, seed=seed), PATCH)])
-    steps = measure(walk(ground, n, relief_mm=relief_mm, seed=seed), ["aligned"])["aligned"]
+    contrast = []
+
+    def seen() -> Iterator[Step]:
+        for step in walk(ground, n, relief_mm=relief_mm, seed=seed):
+            contrast.append(step[0].std())
+            yield step
+
+    steps = measure(seen(), ["aligned"])["aligned"]
     strangers = unrelated(ground, fewer, relief_mm=relief_mm, seed=seed + 20_000)
     flagged = np.array([estimate_motion(*pair, camera=LOW).flag != "" for pair in strangers])
     far = measure(beyond(ground, fewer, relief_mm=relief_mm, seed=seed + 40_000), ["aligned"])["aligned"]
-    return Losses(float(contrast), steps, flagged, far)
+    return Losses(float(np.mean(contrast)), steps, flagged, far)
 
 
 def seconds_of(
@@ -266,12 +230,3 @@ def drifts(
             off = moved(moved(poses[0], poses[-1]), follow(frames))
             gathered[name].append((float(np.hypot(*off[:2])) / length, abs(off.heading_deg) / length))
     return {name: Drift(*np.transpose(errors)) for name, errors in gathered.items()}
-
-
-def _pieces(ground: str | Path, n: int, relief_mm: float, seed: int) -> Iterator[tuple[int, Ground]]:
-    """Pieces of ground, one for each :data:`PATCH` of steps."""
-    for k in range(-(-n // PATCH)):
-        piece = lay_ground(ground, size_mm=ROOM, seed=seed + k)
-        if relief_mm:
-            piece = rough(piece, amplitude_mm=relief_mm, correlation_mm=HILLS, seed=seed + k)
-        yield k, piece
