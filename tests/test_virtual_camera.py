@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from vinemap.camera import Camera
 from vinemap.poses import Pose, moved
 from vinemap.virtual_camera import (
     HIGH,
@@ -20,7 +19,7 @@ from vinemap.virtual_camera import (
 )
 
 CLEAR = Weather(0, 0)
-AHEAD = Camera(**LOW.model_dump() | {"x_mm": 0.0})
+AHEAD = LOW.model_copy(update={"x_mm": 0.0})
 
 
 def dot(x_mm, y_mm, size=1201):
@@ -40,7 +39,7 @@ def seen_at(image):
 @pytest.mark.parametrize("camera", [LOW, HIGH])
 @pytest.mark.parametrize("heading", [0, 20, -65])
 def test_a_point_of_the_ground_is_seen_where_it_is(camera, heading):
-    a, camera = np.radians(heading), Camera(**camera.model_dump() | {"x_mm": 40.0})
+    a, camera = np.radians(heading), camera.model_copy(update={"x_mm": 40.0})
     robot = Pose(-30.0, 12.0, heading)
     place = np.array([20.0, 15.0])  # in the robot's frame
     on_ground = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ place + robot[:2]
