@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     Panels = list[list[Panel]]
 
+PAGE = click.Path(exists=True, dir_okay=False, path_type=Path)
 PARTS = ("terrains", "relief", "sizes", "lost", "paths")
 ROUGH = 8.0
 """Millimetres of relief on which steps are lost, too."""
@@ -100,7 +101,7 @@ def paths(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines], 
 @click.option("--paths", "count", type=click.IntRange(1), default=20, show_default=True, help="Paths of 9.6 m.")
 @click.option("--photograph", "photographs", multiple=True, type=FILE, help="Ground of one's own, 0.4 mm a pixel.")
 @click.option("--out", type=FILE, default=Path("build/odometry"), show_default=True, help="Folder of the plots.")
-@click.option("--docs", type=FILE, help="Markdown file to fill between its marks; a plot goes beside it.")
+@click.option("--docs", type=PAGE, help="Markdown file to fill between its marks; a plot goes beside it.")
 def main(
     parts: Sequence[str],
     steps: int,
