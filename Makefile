@@ -59,8 +59,8 @@ check: $(READY) ## Check style, format and types
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
 
-odometry: $(READY) ## Measure visual odometry on simulated frames
-	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.odometry_accuracy
+odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=5000]
+	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.odometry_accuracy $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
 	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)

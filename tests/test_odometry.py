@@ -8,7 +8,7 @@ import pytest
 from vinemap.camera import Camera
 from vinemap.errors import InputError
 from vinemap.odometry import estimate_motion
-from vinemap.odometry_accuracy import template_error
+from vinemap.odometry_trials import template_error
 from vinemap.poses import Pose, moved
 from vinemap.virtual_camera import HIGH, LOW, Ground, Weather, lay_ground, render, rough, wander
 

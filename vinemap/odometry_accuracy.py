@@ -1,199 +1,153 @@
 """How well odometry measures on simulated frames, whose movement is known: ``python -m vinemap.odometry_accuracy``.
 
-Tables 4.3 and 4.4 of the thesis, its Fig. 4.11, the error gathered along its paths, and what happens when lost.
+Tables 4.3 and 4.4 of the thesis, relief, its Fig. 4.9 to 4.11, what happens when lost, and the error gathered along its
+paths. What misses its bar is marked with "!".
 """
 
 from __future__ import annotations
 
 import time
-from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
-from vinemap.odometry import estimate_motion
-from vinemap.poses import Pose, moved, onward
-from vinemap.tables import as_text
-from vinemap.virtual_camera import (
-    HIGH,
-    LOW,
-    MADE,
-    PHOTOGRAPHS,
-    Ground,
-    lay_ground,
-    render,
-    rough,
-    sinusoid,
-    wander,
+from vinemap import odometry_plots as plots
+from vinemap.cli import FILE, plain_errors
+from vinemap.odometry_tables import MOST_SECONDS, drift_table, loss_table, relief_table, size_table, terrain_tables
+from vinemap.odometry_trials import (
+    SHARES,
+    drifts,
+    frames_to_time,
+    losses,
+    measure,
+    pool,
+    relief_errors,
+    seconds_of,
+    size_of,
 )
+from vinemap.tables import as_markdown, as_text, fill
+from vinemap.virtual_camera import LOW, MADE, PHOTOGRAPHS, lay_ground
+from vinemap.virtual_steps import PATCH, walk
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from vinemap.odometry_plots import Panel
+    from vinemap.odometry_tables import Lines
 
-    from vinemap.camera import Camera
-    from vinemap.odometry import Method
-    from vinemap.virtual_camera import Image
+    Panels = list[list[Panel]]
 
-    Array = NDArray[np.floating]
-
-ROOM = (1000.0, 1000.0)
-"""Millimetres of ground for robots that wander."""
-FAILURE = 5.0
-"""Millimetres from which on a step is wrong."""
-METHODS: tuple[Method, ...] = ("maximum", "centroid", "quadratic", "aligned")
-NAMES = {"maximum": "standard"}
-SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8)
-PATHS = 20
-
-
-class Errors(NamedTuple):
-    """What is wrong with the steps of a ground by a method."""
-
-    place: Array
-    """Error (n,) of the template's place in mm (Eq. 13)."""
-    turn: Array
-    """Error (n,) of the rotation in degrees (Eq. 14)."""
-    flagged: Array
-    seconds: Array
-
-    def cep(self) -> float:
-        """Circular error probable: half of the steps are better."""
-        return float(np.median(self.place))
+PAGE = click.Path(exists=True, dir_okay=False, path_type=Path)
+PARTS = ("terrains", "relief", "sizes", "lost", "paths")
+ROUGH = 8.0
+"""Millimetres of relief on which steps are lost, too."""
+TITLES = {
+    "places": "Place of the template (Table 4.3)",
+    "turns": "Rotation (Table 4.4)",
+    "relief": "Grass with relief",
+    "sizes": "Size of the template: time of a pair, highest speed, errors (Fig. 4.9 to 4.11)",
+    "lost": "Lost: errors above 5 mm",
+    "paths": "Error at the end of sinusoidal paths of 9.6 m, over their length (Fig. 4.8)",
+}
 
 
-Step = tuple["Image", "Image", Pose]
-
-
-def steps_of(ground: Ground, poses: Sequence[Pose], *, camera: Camera = LOW, seed: int = 0) -> Iterator[Step]:
-    """Frames of the poses of a path, pair by pair, each with the true movement."""
-    frames = (render(ground, pose, camera=camera, seed=seed + k) for k, pose in enumerate(poses))
-    for pair, step in zip(pairwise(frames), pairwise(poses), strict=True):
-        yield *pair, moved(*step)
-
-
-def template_error(movement: Pose, truth: Pose, camera: Camera) -> float:
-    """Millimetres in the next frame from where the middle of a frame is found to where it is."""
-    x, y = camera.ground(camera.width // 2, camera.height // 2)
-    middle = Pose(x, y, 0.0)
-    found, true = (moved(step, middle) for step in (movement, truth))
-    return float(np.hypot(found.x_mm - true.x_mm, found.y_mm - true.y_mm))
-
-
-def measure(steps: Iterator[Step], methods: Sequence[Method], *, camera: Camera = LOW) -> dict[Method, Errors]:
-    """Errors of methods on the same steps."""
-    found: dict[Method, list[tuple[float, float, bool, float]]] = {method: [] for method in methods}
-    for frame, next_frame, truth in steps:
-        for method, errors in found.items():
-            began = time.perf_counter()
-            motion = estimate_motion(frame, next_frame, camera=camera, method=method)
-            took = time.perf_counter() - began
-            off = template_error(motion.movement, truth, camera), abs(motion.rotation_deg - truth.heading_deg)
-            errors.append((*off, motion.flag != "", took))
-    return {method: Errors(*np.transpose(errors)) for method, errors in found.items()}
-
-
-def terrains(steps: int) -> str:
-    """Tables 4.3 and 4.4: a line a ground, and those of grass with relief."""
-    cases = [(name, 0.0) for name in (*PHOTOGRAPHS, *MADE)] + [("grass", 8.0), ("grass", 25.0)]
-    place = [["ground", *(f"{NAMES.get(m, m)}: {what}" for m in METHODS for what in ("CEP mm", "σ mm")), "better: %"]]
-    turn = [["ground", *(f"{NAMES.get(m, m)}: {what}" for m in METHODS for what in ("mean °", "σ °")), "better: %"]]
-    lost = [["ground", "wrong: steps", "flagged: of these", "flagged: of the right", "of: steps"]]
-    for name, relief in cases:
-        ground = lay_ground(name, size_mm=ROOM, seed=1)
-        if relief:
-            ground = rough(ground, amplitude_mm=relief, correlation_mm=30.0, seed=1)
-        errors = measure(steps_of(ground, wander(steps + 1, seed=2)), METHODS)
-        label = f"{name}, relief {relief:g} mm" if relief else name
-        right = {m: e.place < FAILURE for m, e in errors.items()}
-        ceps = [e.cep() for e in errors.values()]
-        sigmas = [float(e.place[right[m]].std()) for m, e in errors.items()]
-        means = [float(e.turn[right[m]].mean()) for m, e in errors.items()]
-        spreads = [float(e.turn[right[m]].std()) for m, e in errors.items()]
-        place.append([label, *_woven(ceps, sigmas), f"{100 * (1 - ceps[-1] / ceps[0]):.0f}"])
-        turn.append([label, *_woven(means, spreads), f"{100 * (1 - means[-1] / means[0]):.0f}"])
-        flagged, good = errors["aligned"].flagged.astype(bool), right["aligned"]
-        counts = (~good).sum(), (flagged & ~good).sum(), (flagged & good).sum(), steps
-        lost.append([label, *map(str, counts)])
-    title = "Place of the template (Table 4.3)", "Rotation (Table 4.4)", f"Lost: errors above {FAILURE:g} mm"
-    return "\n\n".join(f"{head}\n{as_text(lines)}" for head, lines in zip(title, (place, turn, lost), strict=True))
-
-
-def times(repeats: int) -> str:
-    """Fig. 4.11: time of a pair and highest speed against the size of the template."""
-    lines = [
-        ["template", *(f"{size}: {what}" for size in ("320 × 240", "1280 × 720") for what in ("ms", "most mm", "m/s"))]
+def terrains(grounds: Sequence[str | Path], steps: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Tables and plots of every method on every ground, random step by random step."""
+    found = {str(ground): measure(walk(ground, steps, seed=1000 * k)) for k, ground in enumerate(grounds)}
+    errors = pool(list(found.values()))
+    scattered: list[Panel] = [
+        partial(plots.scatter, errors=errors["maximum"], title="standard"),
+        partial(plots.scatter, errors=errors["centroid"], title="centroid"),
+        partial(plots.scatter, errors=errors["aligned"], title="aligned"),
     ]
-    ground = lay_ground("gravel", size_mm=ROOM, seed=1)
-    pairs = {c: [render(ground, p, camera=c, seed=k) for k, p in enumerate(wander(2, seed=3))] for c in (LOW, HIGH)}
-    for share in SHARES:
-        cells = []
-        for camera, pair in pairs.items():
-            took = _fastest(pair, camera, share, repeats)
-            most = (1 - share) / 2 * camera.height * camera.above_ground_mm / camera.fy
-            cells += [f"{1000 * took:.1f}", f"{most:.0f}", f"{most / 1000 / took:.1f}"]
-        lines.append([f"{share:g}", *cells])
-    began = time.perf_counter()
-    estimate_motion(*pairs[LOW], camera=LOW, search="exhaustive")
-    whole = f"Exhaustive search, 320 × 240, template 0.2: {1000 * (time.perf_counter() - began):.1f} ms"
-    title = "Time of a pair, and highest speed at which the template stays in the next frame (Fig. 4.11)"
-    return f"{title}\n{as_text(lines)}\n{whole}"
+    boxes: list[Panel] = [partial(plots.places, errors=errors), partial(plots.turns, errors=errors)]
+    return terrain_tables(found), {"errors": [boxes], "scatter": [scattered]}
 
 
-def paths(count: int) -> str:
-    """Error gathered along the thesis's sinusoidal path, over the length travelled."""
-    poses = sinusoid()
-    length = sum(np.hypot(*moved(*step)[:2]) for step in pairwise(poses)) / 1000
-    lines = [["method", "translation: mm/m", "its worst", "heading: °/m", "its worst"]]
-    gathered: dict[Method, list[tuple[float, float]]] = {method: [] for method in METHODS}
-    names = (*PHOTOGRAPHS, *MADE)
-    shifted = [Pose(pose.x_mm - 5750.0, pose.y_mm, pose.heading_deg) for pose in poses]
-    for k in range(count):
-        ground = lay_ground(names[k % len(names)], size_mm=(10300.0, 1100.0), seed=100 + k)
-        tracks = {method: [shifted[0]] for method in METHODS}
-        for frame, next_frame, _ in steps_of(ground, shifted, seed=1000 * k):
-            for method, track in tracks.items():
-                motion = estimate_motion(frame, next_frame, camera=LOW, method=method)
-                track.append(onward(track[-1], motion.movement))
-        for method, track in tracks.items():
-            off = moved(shifted[-1], track[-1])
-            gathered[method].append((float(np.hypot(*off[:2])) / length, abs(off[2]) / length))
-    for method, errors in gathered.items():
-        place, turn = np.transpose(errors)
-        cells = [f"{value:.3f}" for value in (place.mean(), place.max(), turn.mean(), turn.max())]
-        lines.append([NAMES.get(method, method), *cells])
-    return f"Error at the end of {count} paths of {length:.1f} m, over their length (Fig. 4.8)\n{as_text(lines)}"
+def relief(steps: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table of grass with relief."""
+    return {"relief": relief_table(relief_errors(steps, seed=200_000))}, {}
 
 
-def _woven(values: Sequence[float], spreads: Sequence[float]) -> list[str]:
-    return [f"{number:.3f}" for pair in zip(values, spreads, strict=True) for number in pair]
+def sizes(grounds: Sequence[str | Path], steps: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table and plot of sizes of the template."""
+    frames = frames_to_time()
+    found = [size_of(share, frames, grounds, steps, seed=100_000) for share in SHARES]
+    exhaustive = seconds_of(frames["320 × 240"], camera=LOW, search="exhaustive")
+    times = partial(plots.times, sizes=found, exhaustive=exhaustive, bar=MOST_SECONDS)
+    return {"sizes": size_table(found, exhaustive)}, {"sizes": [[times, partial(plots.speeds, sizes=found)]]}
 
 
-def _fastest(pair: Sequence[Image], camera: Camera, share: float, repeats: int) -> float:
-    """Median seconds of a pair."""
-    took = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        estimate_motion(*pair, camera=camera, template_share=share)
-        took.append(time.perf_counter() - began)
-    return float(np.median(took))
+def lost(grounds: Sequence[str | Path], pairs: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table of what is lost; its name says of how many pairs."""
+    found = {str(ground): losses(ground, pairs, seed=1000 * k) for k, ground in enumerate(grounds, 300)}
+    found[f"grass, relief {ROUGH:g} mm"] = losses("grass", pairs, relief_mm=ROUGH, seed=400_000)
+    return {f"lost {pairs}": loss_table(found)}, {}
+
+
+def paths(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table and plot of the error gathered along paths."""
+    found = drifts(grounds, count, seed=100)
+    boxes: list[Panel] = [partial(plots.drifted, drift=found), partial(plots.turned, drift=found)]
+    return {"paths": drift_table(found)}, {"paths": [boxes]}
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("--steps", type=click.IntRange(2), default=300, show_default=True, help="Pairs of frames a ground.")
-@click.option("--paths", "count", type=click.IntRange(0), default=PATHS, show_default=True, help="Paths of 9.6 m.")
-def command(steps: int, count: int) -> None:
-    """Measure odometry on simulated frames, on one core."""
+@click.argument("parts", nargs=-1, type=click.Choice(PARTS), metavar="[PART]...")
+@click.option("--steps", type=click.IntRange(1), default=300, show_default=True, help="Random steps a ground.")
+@click.option("--pairs", type=click.IntRange(5), default=300, show_default=True, help="The same, for what gets lost.")
+@click.option("--paths", "count", type=click.IntRange(1), default=20, show_default=True, help="Paths of 9.6 m.")
+@click.option("--photograph", "photographs", multiple=True, type=FILE, help="Ground of one's own, 0.4 mm a pixel.")
+@click.option("--out", type=FILE, default=Path("build/odometry"), show_default=True, help="Folder of the plots.")
+@click.option("--docs", type=PAGE, help="Markdown file to fill between its marks; a plot goes beside it.")
+def main(
+    parts: Sequence[str],
+    steps: int,
+    pairs: int,
+    count: int,
+    photographs: Sequence[Path],
+    out: Path,
+    docs: Path | None,
+) -> None:
+    """Measure odometry on simulated frames, on one core: terrains, relief, sizes, lost and paths, or some of them."""
     import cv2
 
     cv2.setNumThreads(1)
-    click.echo(terrains(steps))
-    click.echo(f"\n{times(9)}")
-    if count:
-        click.echo(f"\n{paths(count)}")
+    began = time.perf_counter()
+    for photograph in photographs:  # at once, if it can't be read
+        lay_ground(photograph, size_mm=(1.0, 1.0))
+    grounds: list[str | Path] = [*PHOTOGRAPHS, *MADE, *photographs]
+    work = {
+        "terrains": partial(terrains, grounds, steps),
+        "relief": partial(relief, steps),
+        "sizes": partial(sizes, grounds, min(steps, PATCH)),
+        "lost": partial(lost, grounds, pairs),
+        "paths": partial(paths, grounds, count),
+    }
+    tables: dict[str, Lines] = {}
+    panels: dict[str, Panels] = {}
+    for part in parts or PARTS:
+        lines, drawn = work[part]()
+        for name, table in lines.items():
+            click.echo(f"{TITLES[name.split()[0]]}\n{as_text(table)}\n")
+        for name, rows in drawn.items():
+            plots.save(rows, out / f"{name}.png")
+        tables |= lines
+        panels |= drawn
+    if docs:
+        text = docs.read_text(encoding="utf-8")
+        for name, table in tables.items():
+            text = fill(text, name, as_markdown(table))
+        docs.write_text(text, encoding="utf-8")
+        if not parts:
+            overview = [panels["errors"][0] + panels["paths"][0][:1], panels["sizes"][0] + panels["paths"][0][1:]]
+            plots.save(overview, docs.with_name("odometry.png"))
+    missed = sum(cell.count("!") for table in tables.values() for line in table[1:] for cell in line)
+    click.echo(f"{missed} values miss their bars (!), in {time.perf_counter() - began:.0f} s", err=True)
 
 
 if __name__ == "__main__":
-    command()
+    with plain_errors():
+        main(standalone_mode=False)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vinemap.camera import Camera
-from vinemap.errors import DependencyError
+from vinemap.errors import DependencyError, InputError
 from vinemap.poses import Pose
 
 if TYPE_CHECKING:
@@ -55,15 +56,24 @@ class Weather(NamedTuple):
 WEATHER = Weather()
 
 
-def lay_ground(name: str, *, size_mm: tuple[float, float], seed: int = 0) -> Ground:
-    """Ground of one of the names of :data:`PHOTOGRAPHS` and :data:`MADE`, wide and high as told.
+def lay_ground(ground: str | Path, *, size_mm: tuple[float, float], seed: int = 0) -> Ground:
+    """Ground of one of the names of :data:`PHOTOGRAPHS` and :data:`MADE`, or of a photograph's file, wide and high.
 
     Photographs are laid as round pieces, each turned and cut at random, so that no place has a copy; where they
     overlap their contrast is kept (Heitz and Neyret 2018, High-performance by-example noise).
+
+    Raises
+    ------
+    InputError
+        If a file isn't an image, or is one of fewer than :data:`PIECE` pixels across.
     """
     rng = np.random.default_rng(seed)
     nx, ny = (round(size / RESOLUTION) for size in size_mm)
-    values = _pieces(_photograph(name), (ny, nx), rng) if name in PHOTOGRAPHS else _made(name, (ny, nx), rng)
+    if ground in MADE:
+        values = _made(str(ground), (ny, nx), rng)
+    else:
+        photograph = _file(ground) if isinstance(ground, Path) else _photograph(ground)
+        values = _pieces(photograph, (ny, nx), rng)
     return Ground(np.clip(np.rint(values), 0, 255).astype(np.uint8))
 
 
@@ -132,6 +142,13 @@ def straight(*, length_mm: float = 9600.0, step_mm: float = 61.0, heading_deg: f
     return [Pose(float(s * np.cos(a)), float(s * np.sin(a)), heading_deg) for s in steps]
 
 
+def above(place: Array, heading_deg: float, *, camera: Camera = LOW) -> Pose:
+    """Pose of a robot whose camera, straight ahead of it, is above a place (2,)."""
+    a = np.radians(heading_deg)
+    x, y = place - camera.x_mm * np.array([np.cos(a), np.sin(a)])
+    return Pose(float(x), float(y), heading_deg)
+
+
 def wander(
     n: int, *, step_mm: float = 70.0, turn_deg: float = 9.0, room_mm: float = 250.0, camera: Camera = LOW, seed: int = 0
 ) -> list[Pose]:
@@ -140,10 +157,7 @@ def wander(
     poses: list[Pose] = []
     place, heading = np.zeros(2), 0.0
     while len(poses) < n:
-        a = np.radians(heading)
-        poses.append(
-            Pose(float(place[0] - camera.x_mm * np.cos(a)), float(place[1] - camera.x_mm * np.sin(a)), heading)
-        )
+        poses.append(above(place, heading, camera=camera))
         heading += rng.uniform(-turn_deg, turn_deg)
         step = np.full(2, np.inf)
         while np.abs(place + step).max() > room_mm:
@@ -187,6 +201,22 @@ def _photograph(name: str) -> Array:
     except ImportError as error:
         raise DependencyError(f"The photograph of {name} comes with scikit-image: pip install scikit-image") from error
     return getattr(data, name)().astype(np.float32)  # type: ignore[no-any-return]
+
+
+def _file(path: Path) -> Array:
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is empty"
+        raise InputError(f"Cannot read the photograph {path}: {why}") from error
+    if image is None:
+        raise InputError(f"Cannot read the photograph {path}: give an image, for example PNG, JPEG or TIFF")
+    height, width = image.shape
+    if min(height, width) < PIECE:
+        raise InputError(f"The photograph {path} has {width} × {height} pixels: give one of {PIECE} at least each way")
+    return image.astype(np.float32)
 
 
 def _pieces(photograph: Array, shape: tuple[int, int], rng: np.random.Generator) -> Array:
