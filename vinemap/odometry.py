@@ -44,8 +44,9 @@ ANGLES = (-9.0, 9.0)
 
 ANGLE_STEP = 1.15
 """Degrees between the angles of the search: what moves the edge of a template of 49 pixels by half a pixel."""
-SMOOTHING = 1.0
-"""Sigma in pixels of the Gaussian that both frames get: interpolation blurs the turned template, and only that one."""
+SMOOTHING, SMOOTHED_SIZE = 1.0, 240
+"""Sigma in pixels of the Gaussian that both frames get, as interpolation blurs the turned template, and only that one;
+it grows with frames whose shorter side has more pixels than that, so that all see the ground's relief alike."""
 NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95
 """n_Γ and m of Eq. 9."""
 COARSE_SIZE = 60
@@ -175,7 +176,8 @@ def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View
         size = f"{image.shape[1]} × {image.shape[0]}"
         raise InputError(f"A frame has {size} pixels, the camera {camera.width} × {camera.height}: give frames of one")
     values = image.astype(np.float32)
-    smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), SMOOTHING), np.float32)
+    sigma = SMOOTHING * max(1.0, min(image.shape) / SMOOTHED_SIZE)
+    smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
     coarse = _reduced(values)
     contrast = float(values.std())
     sharpness = float(cv2.Laplacian(smooth, cv2.CV_32F).std()) / max(contrast, LEAST_CONTRAST)
