@@ -149,15 +149,21 @@ def broken(folder):
         (folder / f"{k}.png").write_bytes(b"\x89PNG")
 
 
+def black(folder):
+    for k in range(3):
+        cv2.imwrite(str(folder / f"{k}.png"), np.zeros((240, 320), np.uint8))
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
+        (black, r"none of 3 frames could be measured from another \(blank\)"),
         (one_frame, "one frame alone shows no movement: give two at least"),
         (other_size, "3 of 3 frames don't have the camera's 320 × 240 pixels"),
         (broken, "3 of 3 frames can't be read"),
     ],
 )
-def test_too_few_frames_leave_nothing(make, says, tmp_path):
+def test_frames_without_a_movement_leave_nothing(make, says, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     make(folder)
@@ -168,9 +174,11 @@ def test_too_few_frames_leave_nothing(make, says, tmp_path):
 
 def test_what_is_there_stays(recording, rows, tmp_path):
     (tmp_path / "text.gpkg").write_text("mine")
+    gpd.GeoDataFrame(geometry=[shapely.Point(0, 0)], crs=32632).to_file(tmp_path / "poses.gpkg", layer="poses")
     for out, says in [
         (rows, "holds"),
         (tmp_path / "text.gpkg", "isn't a track"),
+        (tmp_path / "poses.gpkg", "holds other layers"),
         (tmp_path / "track.shp", "ends in .gpkg"),
         (tmp_path / "nowhere" / "track.gpkg", "its folder isn't there"),
     ]:
@@ -183,6 +191,10 @@ def test_what_is_there_stays(recording, rows, tmp_path):
 def test_a_start_elsewhere_is_told(recording, rows, tmp_path):
     with pytest.raises(InputError, match="km from the nearest row: give it as latitude, longitude"):
         map_drive([recording], tmp_path / "a.gpkg", camera=LOW, start=Start(7.92442, 44.61167, 0), rows=rows)
+    empty = gpd.GeoDataFrame({"label": ["1"]}, geometry=[shapely.LineString()], crs=32632)
+    empty.to_file(tmp_path / "empty.gpkg", layer="rows")
+    with pytest.raises(InputError, match="holds no row"):
+        map_drive([recording], tmp_path / "a.gpkg", camera=LOW, start=START, rows=tmp_path / "empty.gpkg")
     with pytest.raises(InputError, match="need a start"):
         map_drive([recording], tmp_path / "a.gpkg", camera=LOW, rows=rows)
 
@@ -207,7 +219,7 @@ def test_the_command(recording, rows, tmp_path):
         (["--start", "44.6,7.9"], "isn't latitude, longitude and heading"),
         (["--start", "144.6,7.9,10"], "lies nowhere"),
         (["--start", "44.6,7.9,nan"], "clockwise from north"),
-        (["--template-share", "0.01"], "0.01 of 240 pixels: give a share"),
+        (["--template-share", "0.01"], "0.01 of 240 pixels: give 0.8 at most"),
         (["--template-share", "0"], "0"),
         (["--camera", "other.yaml"], "other.yaml: no such file"),
         (["--camera", "bad.yaml"], "bad.yaml: fx is missing"),

@@ -96,6 +96,13 @@ def test_colour_and_16_bits_are_as_good_as_grey(tmp_path, shots):
     assert np.array_equal(frames[3].image, shots[1])
 
 
+def test_a_hot_pixel_of_16_bits_blinds_nothing(tmp_path, shots):
+    deep = [shot.astype(np.uint16) * 4 for shot in shots[:3]]
+    deep[1][7, 7] = 65535
+    frames, _ = read(save(tmp_path / "a", {f"{k}.png": image for k, image in enumerate(deep)}))
+    assert np.array_equal(frames[2].image, shots[2])
+
+
 def test_flaws_are_told_frame_by_frame(tmp_path, shots):
     folder = save(tmp_path / "a", {f"{k}.png": shot for k, shot in enumerate(shots)})
     save(folder, {"6.jpg": shots[0], "7.jpg": shots[0]})

@@ -89,7 +89,7 @@ MAY_IMPORT = {
     "frames": {"errors", "camera"},
     "track": {"camera", "frames", "odometry", "poses"},
     "track_table": {"crs", "errors", "poses", "track"},
-    "drive": BASE | {"camera", "evaluate", "frames", "odometry", "track", "track_table", "vector"},
+    "drive": BASE | {"camera", "evaluate", "frames", "odometry", "poses", "track", "track_table", "vector"},
     "paths": set(),
     "store": {"errors", "paths"},
     "recipe": CHAIN,

@@ -188,6 +188,20 @@ def test_a_turn_beyond_the_angles_is_flagged(grounds):
     assert flags([frames]) != [""]
 
 
+def test_some_dirt_on_the_lens_is_never_taken_for_standing_still(walk):
+    """Twenty dark spots at the same places of all frames, on a twentieth of them."""
+    import cv2
+
+    rng, clear = np.random.default_rng(1), np.ones((240, 320), np.float32)
+    for _ in range(20):
+        spot = np.zeros_like(clear)
+        cv2.circle(spot, (int(rng.integers(320)), int(rng.integers(240))), int(rng.integers(3, 15)), 1, -1)
+        clear *= 1 - rng.uniform(0.4, 0.8) * cv2.GaussianBlur(spot, (0, 0), 2)
+    for frame, next_frame, truth in [*walk["gravel"], *walk["soil"]]:
+        motion = estimate_motion(*((image * clear).astype(np.uint8) for image in (frame, next_frame)), camera=LOW)
+        assert motion.flag or template_error(motion.movement, truth, LOW) < 5
+
+
 def test_blur_is_flagged(grounds):
     pose = Pose(-950, 0, 0)
     frames = [render(grounds["gravel"], pose, weather=Weather(blur=blur)) for blur in (0, 4)]

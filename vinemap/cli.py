@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FILE = click.Path(path_type=Path)
-SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+SHARE = click.FloatRange(0, 0.8, min_open=True)
 METHODS = ("aligned", "quadratic", "centroid", "maximum")
 
 
@@ -228,7 +228,7 @@ def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | Non
 @click.option("--rows", type=FILE, help="GeoPackage of vine rows, for the distance to the nearest one.")
 @click.option(
     "--template-share",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    type=SHARE,
     default=0.2,
     help="Template, of the image's height; 0.2.",
 )

@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pyogrio
+import shapely
 
 from vinemap.crs import WGS84, metric_crs
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate import read_lines
 from vinemap.frames import read_recording
 from vinemap.odometry import ANGLES
-from vinemap.track import follow
+from vinemap.poses import STILL
+from vinemap.track import Fix, follow
 from vinemap.track_table import NOWHERE, beside_rows, track_layers
 from vinemap.vector import TRACK_LAYERS, write_geopackage
 
@@ -26,7 +28,6 @@ if TYPE_CHECKING:
     from vinemap.crs import Start
     from vinemap.frames import Frame
     from vinemap.odometry import Method
-    from vinemap.track import Fix
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 
@@ -91,14 +92,14 @@ def map_drive(
     Raises
     ------
     InputError
-        If a path holds no frames, or fewer than two can be used, or the rows can't be.
+        If a path holds no frames, or nothing can be measured, or the rows can't be used.
     OutputError
         If the GeoPackage can't be written, or the file there holds something else.
     """
     _check_out(out, rows)
     if rows and not start:
         raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
-    lines = read_lines(rows) if rows else None
+    lines = _rows_of(rows) if rows else None
     crs = _crs_of(start, lines)
     source = read_recording(recording, camera=camera)
 
@@ -112,6 +113,8 @@ def map_drive(
             return layers
         return layers | {"poses": beside_rows(layers["poses"], lines)}
 
+    if lines is not None:
+        placed([Fix("", None, STILL, 0.0, 0.0, 0.0, "", None)])  # whether start and rows go together
     fixes = step(STAGES[0], followed)
     _check_fixes(fixes, recording, camera)
     layers = step(STAGES[1], placed, fixes)
@@ -127,26 +130,37 @@ def map_drive(
     )
 
 
+def _rows_of(path: Path) -> gpd.GeoDataFrame:
+    """The lines of a file that aren't empty."""
+    rows = read_lines(path)
+    shapes = rows.geometry.to_numpy()
+    rows = rows[~(shapely.is_missing(shapes) | shapely.is_empty(shapes))]
+    if len(rows) == 0:
+        raise InputError(f"{path}: holds no row: give a GeoPackage with vine rows")
+    if rows.crs is None:
+        raise InputError(f"{path}: has no CRS: save the rows with it, in QGIS say")
+    return rows
+
+
 def _crs_of(start: Start | None, rows: gpd.GeoDataFrame | None) -> CRS:
     """CRS of a track: the rows' if it is metric, else the UTM zone of the start."""
     if start is None:
         return NOWHERE
     if rows is None:
         return metric_crs(WGS84, start.lon, start.lat)
-    if rows.crs is None:
-        raise InputError("The rows have no CRS: save them with it, in QGIS say")
-    if len(rows) == 0:
-        return metric_crs(WGS84, start.lon, start.lat)
     west, south, east, north = rows.total_bounds
     return metric_crs(rows.crs, (west + east) / 2, (south + north) / 2)
 
 
 def _check_fixes(fixes: Sequence[Fix], recording: Sequence[Path], camera: Camera) -> None:
-    """Raise InputError if less than two frames could be used."""
+    """Raise InputError if nothing was measured."""
     name = recording[0]
+    if any(fix.measured_from is not None for fix in fixes):
+        return
     used = [fix for fix in fixes if fix.flag not in ("unreadable", "size")]
     if len(used) > 1:
-        return
+        flags = ", ".join(sorted({fix.flag for fix in used} - {""}))
+        raise InputError(f"{name}: none of {len(fixes)} frames could be measured from another ({flags})")
     if len(fixes) == 1:
         raise InputError(f"{name}: one frame alone shows no movement: give two at least")
     wrong = sum(fix.flag == "size" for fix in fixes)
@@ -168,14 +182,15 @@ def _check_out(out: Path, rows: Path | None) -> None:
         raise OutputError(f"{out}: holds the rows: choose another file for the track")
     if out.exists():
         try:
-            others = {str(name) for name, _ in pyogrio.list_layers(out)} - {*TRACK_LAYERS, "layer_styles"}
+            layers = {str(name) for name, _ in pyogrio.list_layers(out)} - {"layer_styles"}
         except Exception as error:  # GDAL's errors come in several classes
             raise OutputError(f"{out}: is there, and isn't a track: choose another file") from error
-        if others:
-            raise OutputError(f"{out}: holds other layers ({', '.join(sorted(others))}): choose another file")
+        if layers != set(TRACK_LAYERS):
+            raise OutputError(f"{out}: holds other layers ({', '.join(sorted(layers))}): choose another file")
 
 
 def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:
+    out = out.resolve()
     draft = out.with_name(f".{out.name}.part.gpkg")
     try:
         draft.unlink(missing_ok=True)

@@ -35,6 +35,8 @@ END = 4096
 """Bytes at the end of a file among which that is looked for."""
 AHEAD = 8
 """Frames that are decoded before they are asked for."""
+BRIGHTEST = 99.9
+"""Percentile of the grey levels that is brought into 8 bits."""
 MISSES = 50
 """Frames of a video in a row that can't be read before it counts as ended."""
 EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
@@ -248,8 +250,9 @@ def _prepared(frames: Iterator[Frame], camera: Camera) -> Iterator[Frame]:
             yield frame._replace(image=None, flaw="size")
             continue
         if image.dtype != np.uint8:
-            bits = max(bits, int(image.max()).bit_length())  # of the brightest frame so far: many sensors have 10 or 12
-            image = (image >> (bits - 8)).astype(np.uint8)
+            # Many sensors have 10 or 12 of 16 bits. Single hot pixels don't count.
+            bits = max(bits, int(np.percentile(image, BRIGHTEST)).bit_length())
+            image = np.minimum(image >> (bits - 8), 255).astype(np.uint8)
         if maps:
             image = np.asarray(cv2.remap(image, *maps, cv2.INTER_CUBIC), np.uint8)
         yield frame._replace(image=image)

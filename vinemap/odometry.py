@@ -59,6 +59,8 @@ TURNED = 1.2
 """Room that a square needs to turn by 9°, as a share of its half width."""
 SMALLEST_TEMPLATE = 5
 """Half width of a template in pixels."""
+LARGEST_SHARE = 0.8
+"""p_T above which nothing is left to move in."""
 LEAST_CONTRAST = 1.0
 """Standard deviation in grey levels below which a frame shows nothing."""
 LEAST_OVERLAP = 0.1
@@ -82,7 +84,7 @@ class Motion(NamedTuple):
     score: float
     """Normalised cross-correlation of the template at its best place, up to 1."""
     agreement: float
-    """Correlation of all that both frames show, so moved; of a few peaks that with the highest is chosen."""
+    """Correlation of all that both frames show, so moved, by signs; of a few peaks that with the highest is chosen."""
     rival: float
     """The same for the next best place."""
     overlap: float
@@ -130,7 +132,7 @@ def estimate_motion(
     camera : Camera
         Its images, its lens and where it is mounted; frames are taken to be free of distortion.
     template_share : float
-        p_T, width of the template as a share of the image's shorter side, above 0 and below 1.
+        p_T, width of the template as a share of the image's shorter side, up to 0.8.
     angles : (float, float)
         Smallest and largest turn of the robot in degrees, beyond what is expected.
     method : {"aligned", "quadratic", "centroid", "maximum"}
@@ -198,9 +200,9 @@ def motion_between(
 ) -> Motion:
     """:func:`estimate_motion` for frames that are ready, so that each need be made so only once."""
     shorter = min(camera.width, camera.height)
-    if not (2 * SMALLEST_TEMPLATE <= template_share * shorter < shorter):
+    if not (2 * SMALLEST_TEMPLATE <= template_share * shorter <= LARGEST_SHARE * shorter):
         raise InputError(
-            f"template_share = {template_share:g} of {shorter} pixels: give a share below 1 that makes a template of "
+            f"template_share = {template_share:g} of {shorter} pixels: give {LARGEST_SHARE:g} at most, and what makes "
             f"{2 * SMALLEST_TEMPLATE} pixels at least"
         )
     half = round(template_share * shorter / 2)
@@ -391,11 +393,16 @@ def _aligned(search: Search, place: Place) -> Place:
     matrix = np.asarray(found)
     x, y = matrix @ (half, half, 1)
     aligned = Place(float(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))), float(y) + top, float(x) + left)
-    return aligned if np.hypot(aligned.row - place.row, aligned.column - place.column) < 1 else place
+    near_by = np.hypot(aligned.row - place.row, aligned.column - place.column) < 1
+    return aligned if near_by and abs(aligned.angle - place.angle) < search.step else place
 
 
 def _agreement(view: View, next_view: View, centre: Sequence[float], place: Place) -> tuple[float, float]:
-    """Correlation of all that two coarse frames both show, and its share of a frame."""
+    """Correlation of all that two coarse frames both show, and its share of a frame.
+
+    It is the quadrant correlation, as Pearson's for normal values, which a few dark or bright spots that move with the
+    camera can't decide: N. Blomqvist, On a measure of dependence between two random variables, 1950.
+    """
     import cv2
 
     a, b = view.detail, next_view.detail
@@ -408,5 +415,6 @@ def _agreement(view: View, next_view: View, centre: Sequence[float], place: Plac
     overlap = float(shown.mean())
     if overlap < LEAST_OVERLAP:
         return 0.0, overlap
-    x, y = moved[shown] - moved[shown].mean(), b[shown] - b[shown].mean()
-    return float(x @ y / np.sqrt((x @ x) * (y @ y) + 1e-9)), overlap
+    x, y = moved[shown], b[shown]
+    quadrants = np.mean(np.sign(x - np.median(x)) * np.sign(y - np.median(y)))
+    return float(np.sin(np.pi / 2 * quadrants)), overlap

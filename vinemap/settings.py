@@ -168,7 +168,7 @@ class ProductOptions(Options):
 class OdometryOptions(Options):
     """Visual odometry."""
 
-    template_share: float = Field(0.2, gt=0, lt=1, description="width of the template, of the images' shorter side")
+    template_share: float = Field(0.2, gt=0, le=0.8, description="width of the template, of the images' shorter side")
     turn_deg: float = Field(9.0, ge=1, le=90, description="largest turn from a frame to the next, beyond the usual (°)")
     method: Literal["aligned", "quadratic", "centroid", "maximum"] = Field(
         "aligned", description="how steps are refined: ours, two of less, or the standard's bare maximum"

@@ -53,6 +53,7 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
     xy, lat, lon = _on_the_map(east, north, start, crs)
     seconds = np.array([np.nan if fix.time is None else fix.time for fix in fixes])
     dated = np.where(seconds > DATED, seconds, np.nan)
+    seconds = dated if np.isfinite(dated).any() else seconds
     known = seconds[np.isfinite(seconds)]
     poses = gpd.GeoDataFrame(
         {
@@ -89,17 +90,14 @@ def beside_rows(poses: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataF
     poses : GeoDataFrame
         Points in a projected CRS in metres.
     rows : GeoDataFrame
-        Lines in any CRS, named by ``label`` or ``row_id``, else by their order.
+        Lines, one at least, in any CRS, named by ``label`` or ``row_id``, else by their order.
 
     Raises
     ------
     InputError
-        If the first pose lies kilometres from all rows, or there are none.
+        If the first pose lies kilometres from all rows.
     """
-    rows = rows[rows.geometry.notna() & ~rows.geometry.is_empty]
     lines = np.atleast_1d(np.asarray(project(rows.geometry.to_numpy(), rows.crs, poses.crs)))
-    if len(lines) == 0:
-        raise InputError("The rows to measure distances from are none: give a GeoPackage with vine rows")
     points = poses.geometry.to_numpy()
     nearest = shapely.STRtree(lines).query_nearest(points, all_matches=False)[1]
     distance = np.asarray(shapely.distance(points, lines[nearest]))
@@ -108,7 +106,9 @@ def beside_rows(poses: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataF
             f"The start lies {distance[0] / 1000:.0f} km from the nearest row: give it as latitude, longitude, heading"
         )
     column = next((name for name in ("label", "row_id") if name in rows), None)
-    names = rows[column].astype(str).to_numpy() if column else np.arange(1, len(rows) + 1).astype(str)
+    names = np.arange(1, len(rows) + 1).astype(str)
+    if column:
+        names = np.where(rows[column].isna(), names, rows[column].astype(str))
     along = shapely.line_locate_point(shapely.line_merge(lines[nearest]), points)
     return poses.assign(row=names[nearest], row_distance_m=distance, row_position_m=along)
 
