@@ -347,7 +347,8 @@ def _around(search: Search, top: Index, reach: int) -> tuple[Array, Array]:
 def _centroid(search: Search, top: Index) -> Place:
     """Weighted centroid of Γ (Eq. 9–12)."""
     steps, values = _around(search, top, NEIGHBOURS)
-    chosen = (np.linalg.norm(steps, axis=1) <= NEIGHBOURS) & (values >= SHARE_OF_PEAK * values.max())
+    within = np.linalg.norm(steps, axis=1) <= NEIGHBOURS
+    chosen = within & (values >= SHARE_OF_PEAK * values[within].max())
     return place_at(search, top + np.average(steps[chosen], axis=0, weights=values[chosen]))
 
 
