@@ -57,25 +57,25 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m mypy
 
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
-	@$(BIN)/python -m vinemap.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
+	@$(BIN)/python -m vinemap.measure.accuracy.rows $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
 
 odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=5000]
-	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.odometry_accuracy $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
+	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.measure.odometry $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
-	@$(BIN)/python -m vinemap.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
+	@$(BIN)/python -m vinemap.measure.bench.runs $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
 
 picture: $(READY) ## Draw README's picture of a product: make parcel PARCEL=curved picture
-	@$(BIN)/python -m vinemap.picture data/products/barolo/$(or $(PARCEL),curved) $(or $(PARCEL),curved) docs/picture.png
+	@$(BIN)/python -m vinemap.measure.picture data/products/barolo/$(or $(PARCEL),curved) $(or $(PARCEL),curved) docs/picture.png
 
 tune: $(READY) ## Search the [a, b, c] that models canopies best: make tune [CLOUD=FILE BOUNDARY=FILE PARCEL=F]
-	@$(BIN)/python -m vinemap.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")
+	@$(BIN)/python -m vinemap.measure.tune "$(CLOUD)" $(if $(BOUNDARY),--boundary "$(BOUNDARY)") $(if $(PARCEL),--parcel "$(PARCEL)")
 
-web: ## Bundle the pages' scripts and style anew, after a change in vinemap/web (needs node and npm)
-	@cd vinemap/web && npm ci --silent && npm run --silent build
+web: ## Bundle the pages' scripts and style anew, after a change in vinemap/product/pages/web (needs node and npm)
+	@cd vinemap/product/pages/web && npm ci --silent && npm run --silent build
 
 clean: ## Remove .venv and the tools' caches; surveys and products stay
-	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist vinemap/web/node_modules
+	@rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist vinemap/product/pages/web/node_modules
 	@find flows tests vinemap -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(READY): pyproject.toml configs/constraints.txt

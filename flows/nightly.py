@@ -18,12 +18,12 @@ from prefect.states import Completed, Failed
 from flows.serving import serve
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap import paths
-from vinemap.cli import plain_errors
-from vinemap.config import load_estate, load_survey
+from vinemap.cli.main import plain_errors
+from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
-from vinemap.estate import Arrival, arrivals
-from vinemap.plan import FAILED, Outcome, plan_survey
-from vinemap.survey import map_survey
+from vinemap.jobs.estate import Arrival, arrivals
+from vinemap.jobs.plan import FAILED, Outcome, plan_survey
+from vinemap.jobs.survey import map_survey
 
 
 class Night(NamedTuple):

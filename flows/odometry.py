@@ -15,18 +15,18 @@ from prefect.states import Completed, Failed
 
 from flows.parcel import as_tasks
 from vinemap import paths
-from vinemap.cli import frame_progress, plain_errors
-from vinemap.config import DrivesConfig, load_camera, load_drives
-from vinemap.drive import map_drive
+from vinemap.cli.main import frame_progress, plain_errors
+from vinemap.config.surveys import DrivesConfig, load_camera, load_drives
 from vinemap.errors import ConfigError, OutputError, VinemapError, own_fault
+from vinemap.odometry.drive import map_drive
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from prefect import State
 
-    from vinemap.camera import Camera
-    from vinemap.drive import DriveSummary
+    from vinemap.config.camera import Camera
+    from vinemap.odometry.drive import DriveSummary
 
 
 @flow(name="drive", flow_run_name="{drive}", persist_result=False, validate_parameters=False)

@@ -14,15 +14,15 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from vinemap import paths
-from vinemap.cli import plain_errors, progress
-from vinemap.config import SurveyConfig, choose_parcel, load_survey
-from vinemap.crs import parse_crs
+from vinemap.cli.main import plain_errors, progress
+from vinemap.cloud.pdal import check_engine
+from vinemap.config.surveys import SurveyConfig, choose_parcel, load_survey
 from vinemap.errors import ConfigError, InputError
+from vinemap.geo.crs import parse_crs
 from vinemap.parcel import Summary, follow
-from vinemap.pdal_engine import check_engine
-from vinemap.recipe import recipe_of
-from vinemap.scenes import barolo
-from vinemap.synthetic import write_survey
+from vinemap.product.recipe import recipe_of
+from vinemap.simulate.scenes import barolo
+from vinemap.simulate.survey import write_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -32,8 +32,8 @@ from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
 
 from flows.server import LOOPBACK, home, server
+from vinemap.compute.processes import descendants
 from vinemap.errors import ConfigError, VinemapError
-from vinemap.processes import descendants
 
 if TYPE_CHECKING:
     from subprocess import Popen

@@ -17,12 +17,12 @@ from prefect.states import Completed, Failed
 
 from flows.parcel import ensure_cloud
 from vinemap import paths
-from vinemap.cli import plain_errors
-from vinemap.config import SurveyConfig, load_estate, load_survey
+from vinemap.cli.main import plain_errors
+from vinemap.config.surveys import SurveyConfig, load_estate, load_survey
 from vinemap.errors import ConfigError, VinemapError
-from vinemap.estate import arrivals
-from vinemap.plan import FAILED, Outcome
-from vinemap.survey import map_survey
+from vinemap.jobs.estate import arrivals
+from vinemap.jobs.plan import FAILED, Outcome
+from vinemap.jobs.survey import map_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -9,12 +9,12 @@ import pytest
 import shapely
 from lasfiles import write_each
 
-from vinemap.cloud import PointCloud
-from vinemap.config import survey_config
-from vinemap.crs import parse_crs
-from vinemap.scenes import hillside, rows_of
-from vinemap.survey import map_survey
-from vinemap.synthetic import Vineyard, simulate, write_survey
+from vinemap.cloud.points import PointCloud
+from vinemap.config.surveys import survey_config
+from vinemap.geo.crs import parse_crs
+from vinemap.jobs.survey import map_survey
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Vineyard, simulate, write_survey
 
 SHARED = Path(__file__).parents[2] / "shared"
 

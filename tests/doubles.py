@@ -8,7 +8,8 @@ import sys
 import time
 from types import SimpleNamespace
 
-from vinemap import errors, store
+from vinemap import errors
+from vinemap.product import store
 
 
 def follow(recipe, folder, *, piece=None, drafts=None, within=None):

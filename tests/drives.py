@@ -1,8 +1,8 @@
 """Drives of a robot whose poses are known, as frames in memory."""
 
-from vinemap.frames import Frame
-from vinemap.poses import Pose
-from vinemap.virtual_camera import LOW, lay_ground, render
+from vinemap.odometry.frames import Frame
+from vinemap.odometry.poses import Pose
+from vinemap.simulate.camera import LOW, lay_ground, render
 
 
 def poses(n, *, step=40.0, turn=1.0, x=-1300.0):

@@ -11,13 +11,13 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-from vinemap.processes import descendants
+from vinemap.compute.processes import descendants
 
 ROOT = Path(__file__).parents[1]
 SERVE = """
 import json, sys
 from flows.serving import serve
-from vinemap.cli import plain_errors
+from vinemap.cli.main import plain_errors
 with plain_errors():
     serve("job.job", **json.loads(sys.argv[1]))
 """

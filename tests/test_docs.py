@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from vinemap.cli import commands
-from vinemap.config import load_camera, load_drives
-from vinemap.template import template
-from vinemap.vector import LAYERS, TRACK_LAYERS
+from vinemap.cli.main import commands
+from vinemap.config.surveys import load_camera, load_drives
+from vinemap.config.template import template
+from vinemap.product.geopackage import LAYERS, TRACK_LAYERS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -179,27 +179,27 @@ def test_imports_go_one_way(path):
     ("source", "module", "wrong"),
     [
         ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", []),
-        ("from vinemap.cloud import PointCloud", "evaluate", []),
-        ("from vinemap.key_points import find", "curves", ["key_points"]),
+        ("from vinemap.cloud.points import PointCloud", "evaluate", []),
+        ("from vinemap.rows.key_points import find", "curves", ["key_points"]),
         ("from vinemap import curves, raster", "key_points", ["curves"]),
         ("import vinemap.parcel", "ground", ["parcel"]),
         ("from . import cloud", "errors", ["cloud"]),
         ("from .vector import write", "crs", ["vector"]),
-        ("if TYPE_CHECKING:\n    from vinemap.row_field import RowField", "mesh", ["row_field"]),
-        ("def f():\n    from vinemap.config import Config", "curves", ["config"]),
-        ("from vinemap.config import Config\nfrom vinemap import paths", "parcel", []),
+        ("if TYPE_CHECKING:\n    from vinemap.rows.field import RowField", "mesh", ["row_field"]),
+        ("def f():\n    from vinemap.config.surveys import Config", "curves", ["config"]),
+        ("from vinemap.config.surveys import Config\nfrom vinemap import paths", "parcel", []),
         ("from vinemap.parcel import follow", "config", ["parcel"]),
-        ("from vinemap.raster import Raster", "synthetic", ["raster"]),
-        ("from vinemap.scenes import rows_of", "synthetic", ["scenes"]),
-        ("from vinemap.synthetic import simulate", "scenes", []),
+        ("from vinemap.geo.raster import Raster", "synthetic", ["raster"]),
+        ("from vinemap.simulate.scenes import rows_of", "synthetic", ["scenes"]),
+        ("from vinemap.simulate.survey import simulate", "scenes", []),
         ("from prefect import task", "parcel", ["prefect"]),
         ("import prefect.futures", "cli", ["prefect"]),
         ("from flows.parcel import map_parcel", "cli", ["flows"]),
-        ("from vinemap.cli import main", "parcel", ["cli"]),
+        ("from vinemap.cli.main import main", "parcel", ["cli"]),
         ("from vinemap.export.nav2 import write_nav2", "export.write", []),
         ("from vinemap.export.nav2 import write_nav2", "export.isoxml", ["export.nav2"]),
         ("from vinemap.export import nav2", "lanes", ["export.nav2"]),
-        ("from vinemap.store import product", "export.nav2", ["store"]),
+        ("from vinemap.product.store import product", "export.nav2", ["store"]),
     ],
 )
 def test_the_rule_sees_a_breach(source, module, wrong):
@@ -219,7 +219,7 @@ def test_every_room_has_a_purpose_in_its_name():
 
 
 def test_the_command_line_starts_without_heavy_libraries():
-    code = "import json, sys, vinemap.cli; print(json.dumps(sorted(sys.modules)))"
+    code = "import json, sys, vinemap.cli.main; print(json.dumps(sorted(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert {"prefect", "open3d", "geopandas", "rasterio"} & set(json.loads(run.stdout)) == set()
 

@@ -12,13 +12,13 @@ import shapely
 import trimesh
 
 from vinemap import paths
-from vinemap.crs import Origin, main_to_wgs84
 from vinemap.errors import InputError, OutputError
-from vinemap.evaluate import evaluate_rows
+from vinemap.evaluate.rows import evaluate_rows
+from vinemap.geo.crs import Origin, main_to_wgs84
 from vinemap.parcel import STAGES, call, map_parcel
-from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Obstacle, Vineyard, simulate, write_survey
-from vinemap.vector import LAYERS
+from vinemap.product.geopackage import LAYERS
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Obstacle, Vineyard, simulate, write_survey
 
 RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 

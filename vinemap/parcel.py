@@ -13,37 +13,39 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from vinemap import __version__, machine, paths, store
-from vinemap.blocks import group_blocks
-from vinemap.canopy import NO_CANOPY, find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
-from vinemap.cgon import enclose, grow, peel_sections
-from vinemap.classification import classify_points
-from vinemap.cloud import join
-from vinemap.clustering import cluster_rows
-from vinemap.compiled import in_threads
-from vinemap.confidence import judge_rows
-from vinemap.config import check_name
-from vinemap.cover import canopy_cover
-from vinemap.crs import Origin, to_main, to_wgs84
-from vinemap.curves import trace_rows
+from vinemap import __version__, paths
+from vinemap.canopy.cgon import enclose, grow, peel_sections
+from vinemap.canopy.classification import classify_points
+from vinemap.canopy.foliage import NO_CANOPY, find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
+from vinemap.canopy.numbers import Measures, measure_sections, summarise_rows, tabulate_sections
+from vinemap.canopy.sections import cut_sections
+from vinemap.cloud.las import read_cloud, write_classified
+from vinemap.cloud.pdal import check_engine, pdal_versions, read_cloud_pdal
+from vinemap.cloud.pieces import read_piece
+from vinemap.cloud.points import join
+from vinemap.cloud.tiles import Collector
+from vinemap.compute import machine
+from vinemap.compute.threads import in_threads
+from vinemap.config.surveys import check_name
 from vinemap.errors import InputError, own_fault
-from vinemap.ground import block_side, canopy_height_model, terrain_model
-from vinemap.key_points import detect_key_points
-from vinemap.las import read_cloud, write_classified
-from vinemap.missing import count_missing
-from vinemap.notices import notices
-from vinemap.pdal_engine import check_engine, pdal_versions, read_cloud_pdal
-from vinemap.pieces import read_piece
-from vinemap.product import labelled, parcel_layer, write_product
-from vinemap.recipe import Recipe, recipe_of
-from vinemap.report import parcel_page
-from vinemap.row_field import estimate_row_field, refine_row_field
-from vinemap.row_fit import fit_rows
-from vinemap.row_table import describe_rows, number_rows
-from vinemap.section_table import Measures, measure_sections, summarise_rows, tabulate_sections
-from vinemap.sections import cut_sections
-from vinemap.stac import parcel_item, save
-from vinemap.tiles import Collector
+from vinemap.geo.crs import Origin, to_main, to_wgs84
+from vinemap.product import store
+from vinemap.product.notices import notices
+from vinemap.product.pages.parcel import parcel_page
+from vinemap.product.recipe import Recipe, recipe_of
+from vinemap.product.stac import parcel_item, save
+from vinemap.product.write import labelled, parcel_layer, write_product
+from vinemap.rows.blocks import group_blocks
+from vinemap.rows.clusters import cluster_rows
+from vinemap.rows.confidence import judge_rows
+from vinemap.rows.curves import trace_rows
+from vinemap.rows.field import estimate_row_field, refine_row_field
+from vinemap.rows.fit import fit_rows
+from vinemap.rows.key_points import detect_key_points
+from vinemap.rows.missing import count_missing
+from vinemap.rows.numbers import describe_rows, number_rows
+from vinemap.surfaces.cover import canopy_cover
+from vinemap.surfaces.ground import block_side, canopy_height_model, terrain_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -53,12 +55,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.canopy import Canopy
-    from vinemap.cloud import Sections
-    from vinemap.pieces import Piece
-    from vinemap.raster import Raster, RowField
-    from vinemap.settings import Settings
-    from vinemap.tiles import Cloud
+    from vinemap.canopy.foliage import Canopy
+    from vinemap.cloud.pieces import Piece
+    from vinemap.cloud.points import Sections
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.config.settings import Settings
+    from vinemap.geo.raster import Raster, RowField
 
 T = TypeVar("T")
 
@@ -218,7 +220,7 @@ def follow(
     piece : Piece, optional
         The parcel's points, where the cloud was read before.
     drafts, within : Path, optional
-        As for :func:`vinemap.store.product`.
+        As for :func:`vinemap.product.store.product`.
     step : callable
         As for :func:`map_parcel`.
 

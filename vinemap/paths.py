@@ -195,5 +195,5 @@ def index(folder: Path) -> Path:
 
 def page_part(name: str) -> Path:
     """A template, script or style that pages are made of: ``report.html``, ``report.js``."""
-    web = Path(__file__).parent / "web"
+    web = Path(__file__).parent / "product" / "pages" / "web"
     return web / name if name.endswith(".html") else web / "dist" / name

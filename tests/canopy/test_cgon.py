@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 from shapely import MultiPoint, Point, Polygon
 
-from vinemap.cgon import enclose, grow, hull, peel, peel_sections
+from vinemap.canopy.cgon import enclose, grow, hull, peel, peel_sections
 
 
 def cross(a, b, p):

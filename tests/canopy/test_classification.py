@@ -4,11 +4,11 @@ import laspy
 import numpy as np
 import pytest
 
-from vinemap.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
-from vinemap.cloud import PointCloud
-from vinemap.las import write_classified
+from vinemap.canopy.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
+from vinemap.cloud.las import write_classified
+from vinemap.cloud.points import PointCloud
+from vinemap.config.settings import Settings
 from vinemap.parcel import find_canopies, map_rows
-from vinemap.settings import Settings
 
 
 @pytest.fixture(scope="module")

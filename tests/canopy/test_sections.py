@@ -10,13 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from vinemap.canopy import find_feet, foliage_reach, living_canopies, separate_canopy
-from vinemap.cgon import peel_sections
-from vinemap.cloud import NO_SECTIONS, PointCloud, Sections, join
-from vinemap.ground import terrain_model
-from vinemap.parcel import model_sections
-from vinemap.raster import Grid, Raster
-from vinemap.section_table import (
+from vinemap.canopy.cgon import peel_sections
+from vinemap.canopy.foliage import find_feet, foliage_reach, living_canopies, separate_canopy
+from vinemap.canopy.numbers import (
     complexity_reduction,
     measure_sections,
     modelling_indices,
@@ -24,8 +20,12 @@ from vinemap.section_table import (
     summarise_rows,
     tabulate_sections,
 )
-from vinemap.sections import cut_sections
-from vinemap.settings import Settings
+from vinemap.canopy.sections import cut_sections
+from vinemap.cloud.points import NO_SECTIONS, PointCloud, Sections, join
+from vinemap.config.settings import Settings
+from vinemap.geo.raster import Grid, Raster
+from vinemap.parcel import model_sections
+from vinemap.surfaces.ground import terrain_model
 
 UTM = CRS.from_epsg(32632)
 

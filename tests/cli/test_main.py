@@ -10,31 +10,14 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from commands import assert_refused, vinemap
 
-from vinemap.synthetic import write_survey
-
-VINEMAP = [sys.executable, "-m", "vinemap.cli"]
+from vinemap.simulate.survey import write_survey
 
 
 @pytest.fixture(scope="module")
 def survey(vineyard, tmp_path_factory):
     return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
-
-
-def vinemap(*args, cwd):
-    return subprocess.run(
-        [*VINEMAP, *map(str, args)], cwd=cwd, capture_output=True, text=True, timeout=300, check=False
-    )
-
-
-def assert_refused(done, *words):
-    """One line on stderr that says what was wrong, exit code 2, nothing on stdout."""
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("vinemap: ")
-    assert done.stderr.count("\n") == 1
-    for word in words:
-        assert word in done.stderr
-    assert done.stdout == ""
 
 
 def test_run_and_evaluate(tmp_path, survey):

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vinemap.bins import bin_points, quantiles_in
-from vinemap.raster import Grid, cell_of
+from vinemap.cloud.bins import bin_points, quantiles_in
+from vinemap.geo.raster import Grid, cell_of
 
 GRID = Grid(414_700.0, 4_940_710.0, 0.5, 13, 17)
 """Neither a whole number of blocks long nor wide."""

@@ -6,10 +6,10 @@ import pytest
 import shapely
 from pyproj import CRS, Transformer
 
-from vinemap import las
-from vinemap.crs import parse_crs
+from vinemap.cloud import las
+from vinemap.cloud.las import read_cloud
 from vinemap.errors import InputError
-from vinemap.las import read_cloud
+from vinemap.geo.crs import parse_crs
 
 UTM = CRS.from_epsg(32632)
 

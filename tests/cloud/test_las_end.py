@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lasfiles import FORMATS, as_las
 
-from vinemap.las_end import unfinished
+from vinemap.cloud.las_end import unfinished
 
 
 def cuts(whole):

@@ -17,19 +17,20 @@ import rasterio
 import shapely
 from pyproj import CRS, Transformer
 
-from vinemap import paths, pdal_engine
+from vinemap import paths
+from vinemap.cloud import pdal as pdal_engine
+from vinemap.cloud.las import read_cloud
+from vinemap.cloud.pdal import ground_pipeline, read_cloud_pdal, reading_pipeline
+from vinemap.config.settings import GroundOptions, Settings
 from vinemap.errors import DependencyError, InputError
-from vinemap.evaluate import evaluate_rows
-from vinemap.ground import terrain_model
-from vinemap.las import read_cloud
+from vinemap.evaluate.rows import evaluate_rows
+from vinemap.geo.raster import sample
 from vinemap.parcel import map_parcel
-from vinemap.pdal_engine import ground_pipeline, read_cloud_pdal, reading_pipeline
-from vinemap.raster import sample
-from vinemap.settings import GroundOptions, Settings
-from vinemap.synthetic import write_survey
-from vinemap.vector import read_boundary
+from vinemap.product.geopackage import read_boundary
+from vinemap.simulate.survey import write_survey
+from vinemap.surfaces.ground import terrain_model
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 UTM = CRS.from_epsg(32632)
 DEGREES = CRS.from_epsg(4326)
 SQUARE = shapely.box(414710, 4940710, 414730, 4940740)
@@ -350,7 +351,7 @@ def test_with_a_pdal_that_lacks_what_is_used(pdal, monkeypatch):
 @pytest.mark.parametrize(
     ("command", "settings"),
     [
-        (["vinemap.cli", "run", "none.laz", "--settings", "s.yaml"], "ground: {engine: pdal}"),
+        (["vinemap", "run", "none.laz", "--settings", "s.yaml"], "ground: {engine: pdal}"),
         (
             ["flows.parcel", "s.yaml", "F"],
             "{survey: barolo, simulate: barolo, parcels: [F], settings: {ground: {engine: pdal}}}",

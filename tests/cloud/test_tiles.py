@@ -15,15 +15,15 @@ from pyproj import CRS
 from systems import POSIX
 
 from vinemap import paths
-from vinemap.cloud import PointCloud
+from vinemap.cloud.las import collected
+from vinemap.cloud.points import PointCloud
+from vinemap.cloud.tiles import Collector, TiledCloud
+from vinemap.config.settings import ReadingOptions, Settings
 from vinemap.errors import InputError, OutputError
-from vinemap.ground import block_side, canopy_height_model, terrain_model
-from vinemap.las import collected
+from vinemap.geo.raster import grid_over, squares, window
 from vinemap.parcel import call, map_parcel, map_rows, model_canopies
-from vinemap.raster import grid_over, squares, window
-from vinemap.settings import ReadingOptions, Settings
-from vinemap.synthetic import write_survey
-from vinemap.tiles import Collector, TiledCloud
+from vinemap.simulate.survey import write_survey
+from vinemap.surfaces.ground import block_side, canopy_height_model, terrain_model
 
 UTM = CRS.from_epsg(32632)
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
@@ -60,7 +60,7 @@ def on_millimetres(n, *, seed=0, width=150.0):
 @pytest.fixture
 def small_tiles(monkeypatch):
     """Tiles of 8 m, so that a small vineyard has many."""
-    monkeypatch.setattr("vinemap.tiles.SIDE", 8.0)
+    monkeypatch.setattr("vinemap.cloud.tiles.SIDE", 8.0)
 
 
 def test_few_points_stay_in_memory(tmp_path):
@@ -291,7 +291,7 @@ def test_an_error_leaves_no_tiles(tmp_path, survey):
 
 LIMITED = """
 import resource, sys
-from vinemap.cli import main
+from vinemap.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
 main()
 """

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from vinemap import machine
-from vinemap.compiled import ahead, in_threads, stretches
+from vinemap.compute import machine
+from vinemap.compute.threads import ahead, in_threads, stretches
 
 
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 1000])
@@ -82,7 +82,7 @@ def test_no_item_goes_on_after_an_error():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_a_forked_child_has_threads_of_its_own():
     code = (
-        "import os; from vinemap.compiled import in_threads\n"
+        "import os; from vinemap.compute.threads import in_threads\n"
         "assert in_threads(abs, [-1, -2]) == [1, 2]\n"
         "child = os.fork()\n"
         "if child == 0:\n    os._exit(0 if in_threads(abs, [-1, -2]) == [1, 2] else 1)\n"

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from vinemap.camera import Camera
-from vinemap.config import load_camera
+from vinemap.config.camera import Camera
+from vinemap.config.surveys import load_camera
+from vinemap.config.template import template
 from vinemap.errors import ConfigError
-from vinemap.template import template
-from vinemap.virtual_camera import LOW
+from vinemap.simulate.camera import LOW
 
 
 def test_a_pixel_is_as_large_as_the_thesis_says():

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from vinemap.config import check_name, choose_parcel, load_estate, load_settings, load_survey
+from vinemap.config.settings import Settings
+from vinemap.config.surveys import check_name, choose_parcel, load_estate, load_settings, load_survey
 from vinemap.errors import ConfigError
-from vinemap.settings import Settings
 
 SURVEY = "survey: barolo\nparcels: [F, curved, blocks]\n"
 
@@ -95,7 +95,13 @@ def test_defaults_of_settings_are_those_of_the_stages():
     """A stage called without options works as one called with the default settings."""
     import inspect
 
-    from vinemap import canopy, clustering, cover, curves, ground, key_points, row_field, row_fit, sections
+    from vinemap.canopy import foliage as canopy
+    from vinemap.canopy import sections
+    from vinemap.rows import clusters as clustering
+    from vinemap.rows import curves, key_points
+    from vinemap.rows import field as row_field
+    from vinemap.rows import fit as row_fit
+    from vinemap.surfaces import cover, ground
 
     stages = {
         "ground": ground.terrain_model,

@@ -6,11 +6,11 @@ import pytest
 import yaml
 from pydantic.fields import FieldInfo
 
-from vinemap import template as module
-from vinemap.config import EstateConfig, SurveyConfig, load_estate, load_settings, load_survey
+from vinemap.config import template as module
+from vinemap.config.settings import Options, Settings
+from vinemap.config.surveys import EstateConfig, SurveyConfig, load_estate, load_settings, load_survey
+from vinemap.config.template import KINDS, template
 from vinemap.errors import ConfigError
-from vinemap.settings import Options, Settings
-from vinemap.template import KINDS, template
 
 
 def leaves(model, place=""):

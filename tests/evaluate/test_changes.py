@@ -6,8 +6,8 @@ import pytest
 import shapely
 from shapely.ops import substring
 
-from vinemap.changes import compare_rows, estimate_shift, summarise
-from vinemap.scenes import rows_of
+from vinemap.evaluate.changes import compare_rows, estimate_shift, summarise
+from vinemap.simulate.scenes import rows_of
 
 SHIFT = np.array([0.3, 0.4])
 """Of half a metre, at a spacing of 2.5 m."""

@@ -11,20 +11,20 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from commands import assert_refused, vinemap
 from products import tree
 from pyproj import Transformer
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from test_cli import assert_refused, vinemap
 
-from vinemap.crs import parse_crs
 from vinemap.errors import InputError, OutputError
 from vinemap.export import FORMATS
+from vinemap.export.lanes import lanes_between
 from vinemap.export.write import export_products
-from vinemap.lanes import lanes_between
+from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_parcel
-from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Vineyard, simulate, write_survey
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Vineyard, simulate, write_survey
 
 NAME = "Côte 1"
 UTM = parse_crs("EPSG:32632")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import shapely
 
-from vinemap.lanes import lanes_between, resampled
+from vinemap.export.lanes import lanes_between, resampled
 
 
 def field(*lines, spacing=2.5, block=1, **columns):

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import rasterio
 import trimesh
+from meshes import ORIGIN, bumpy, rows
 from pyproj import Transformer
-from test_mesh import ORIGIN, bumpy, rows
 
 from vinemap import paths
-from vinemap.crs import Origin, main_to_wgs84, to_main
+from vinemap.canopy.mesh import volume, write_glb
 from vinemap.errors import InputError
 from vinemap.export.write import export_products
-from vinemap.mesh import volume, write_glb
-from vinemap.mesh_files import read_glb
+from vinemap.geo.crs import Origin, main_to_wgs84, to_main
 from vinemap.parcel import map_parcel
-from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Vineyard, simulate, write_survey
+from vinemap.product.gltf import read_glb
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Vineyard, simulate, write_survey
 
 
 @pytest.fixture(scope="module")

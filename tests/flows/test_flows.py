@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from vinemap.parcel import STAGES
-from vinemap.synthetic import write_survey
+from vinemap.simulate.survey import write_survey
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

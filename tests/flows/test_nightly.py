@@ -10,7 +10,7 @@ import time
 import pytest
 from place import ROOT, Place, wait
 
-from vinemap.synthetic import write_survey
+from vinemap.simulate.survey import write_survey
 
 NIGHTLY = [sys.executable, "-m", "flows.nightly"]
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from place import ROOT, Place, gone, wait
 
-from vinemap.processes import descendants
+from vinemap.compute.processes import descendants
 
 JOB = """
 import time

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 from pyproj import CRS
 
-from vinemap.crs import (
+from vinemap.errors import InputError
+from vinemap.geo.crs import (
     Origin,
     from_wgs84,
     main_to_wgs84,
@@ -19,9 +20,8 @@ from vinemap.crs import (
     vertical_unit,
     wgs84_to_main,
 )
-from vinemap.errors import InputError
 
-TABLE = pd.read_csv(Path(__file__).parents[1] / "data" / "table_2_1.csv")
+TABLE = pd.read_csv(Path(__file__).parents[2] / "data" / "table_2_1.csv")
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.raster import (
+from vinemap.geo.raster import (
     Grid,
     Raster,
     above,

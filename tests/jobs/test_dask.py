@@ -11,19 +11,19 @@ from pathlib import Path
 import pytest
 from products import SURVEYS, many, tree
 
-from vinemap import survey
-from vinemap.config import survey_config
+from vinemap.config.surveys import survey_config
 from vinemap.errors import ConfigError
+from vinemap.jobs import survey
+from vinemap.jobs.plan import DONE
+from vinemap.jobs.survey import map_survey
 from vinemap.parcel import follow
-from vinemap.plan import DONE
-from vinemap.survey import map_survey
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'vinemap[dask]'")
 
 
 def start(*words, cwd):
     log = (cwd / "dask.log").open("ab")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "DASK_LOGGING__DISTRIBUTED": "warning"}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "DASK_LOGGING__DISTRIBUTED": "warning"}
     with log:
         return subprocess.Popen(
             [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
@@ -122,7 +122,7 @@ def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, three, tmp_path
 
 
 def test_a_scheduler_that_does_not_answer(three, tmp_path, monkeypatch):
-    monkeypatch.setattr("vinemap.dask_engine.PATIENCE", 1.0)
+    monkeypatch.setattr("vinemap.jobs.dask.PATIENCE", 1.0)
     with pytest.raises(ConfigError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         job(three, tmp_path / "out", three.with_name("parcels.gpkg"), engine="dask", scheduler="tcp://127.0.0.1:9")
     assert list(tmp_path.iterdir()) == []

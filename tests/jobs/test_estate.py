@@ -10,11 +10,11 @@ import pytest
 import shapely
 from systems import POSIX
 
-from vinemap import estate
-from vinemap.config import EstateConfig, load_estate
+from vinemap.cloud.las import read_cloud
+from vinemap.config.surveys import EstateConfig, load_estate
 from vinemap.errors import InputError
-from vinemap.estate import arrivals
-from vinemap.las import read_cloud
+from vinemap.jobs import estate
+from vinemap.jobs.estate import arrivals
 
 NOW = time.time() + 3600
 """When files that were just written are long settled."""
@@ -347,6 +347,6 @@ def test_what_is_found_can_be_read(clouds, place):
 
 
 def laspy_crs():
-    from vinemap.crs import parse_crs
+    from vinemap.geo.crs import parse_crs
 
     return parse_crs("EPSG:32632")

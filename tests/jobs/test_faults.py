@@ -19,17 +19,20 @@ import pytest
 import shapely
 from systems import LINUX, POSIX
 
-from vinemap import las, paths, recipe, store, survey
-from vinemap.config import survey_config
-from vinemap.crs import parse_crs
+from vinemap import paths
+from vinemap.cloud import las
+from vinemap.cloud.las import read_cloud
+from vinemap.cloud.pieces import read_piece, split_cloud
+from vinemap.cloud.tiles import Collector
+from vinemap.compute.processes import descendants
+from vinemap.config.surveys import survey_config
 from vinemap.errors import BusyError, InputError, OutputError, VinemapError, WorkerError
-from vinemap.las import read_cloud
-from vinemap.pieces import read_piece, split_cloud
-from vinemap.plan import CURRENT, DONE, FAILED, OUTSIDE, plan_survey
-from vinemap.processes import descendants
-from vinemap.survey import map_survey
-from vinemap.tiles import Collector
-from vinemap.vector import read_parcels
+from vinemap.geo.crs import parse_crs
+from vinemap.jobs import survey
+from vinemap.jobs.plan import CURRENT, DONE, FAILED, OUTSIDE, plan_survey
+from vinemap.jobs.survey import map_survey
+from vinemap.product import recipe, store
+from vinemap.product.geopackage import read_parcels
 
 PLACE = np.array([414_700.0, 4_940_700.0])
 SIDE = 10.0
@@ -435,7 +438,7 @@ def test_a_job_beside_another_by_the_command(done):
     before = sorted(done.folder.rglob("*"))
     with store.workshop(done.folder):
         command = subprocess.run(
-            [sys.executable, "-m", "vinemap.cli", *map(str, words)], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "vinemap", *map(str, words)], capture_output=True, text=True, check=False
         )
     assert command.returncode == 2
     assert command.stdout == ""
@@ -537,7 +540,7 @@ def test_a_disk_that_fails_while_laz_is_read(job, tmp_path, backend):
 
 def test_no_scheduler_is_no_fault_of_the_parcels(job, monkeypatch):
     """When it is back, they are worked."""
-    from vinemap import dask_engine
+    from vinemap.jobs import dask as dask_engine
 
     monkeypatch.setattr(dask_engine, "PATIENCE", 0.2)
 

@@ -17,20 +17,20 @@ from products import SURVEYS, content, many, tree
 from systems import POSIX
 
 from vinemap import paths
-from vinemap.config import survey_config
+from vinemap.cloud.las import read_cloud
+from vinemap.cloud.pieces import read_piece, split_cloud
+from vinemap.cloud.tiles import Collector
+from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError, OutputError, WorkerError
-from vinemap.las import read_cloud
+from vinemap.jobs.plan import CURRENT, DONE, FAILED
+from vinemap.jobs.survey import map_survey
 from vinemap.parcel import map_parcel
-from vinemap.pieces import read_piece, split_cloud
-from vinemap.plan import CURRENT, DONE, FAILED
-from vinemap.recipe import product_in
-from vinemap.survey import map_survey
-from vinemap.tiles import Collector
-from vinemap.vector import read_boundary
+from vinemap.product.geopackage import read_boundary
+from vinemap.product.recipe import product_in
 
 KILLS = int(os.environ.get("VINEMAP_KILLS", "2"))
 """Instants at which a job is killed."""
-VINEMAP = [sys.executable, "-m", "vinemap.cli"]
+VINEMAP = [sys.executable, "-m", "vinemap"]
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +292,7 @@ def test_a_fault_in_the_page_hides_no_outcome_nor_error(cloud, boundaries, tmp_p
     def faulty(*args):
         raise ZeroDivisionError("of the page")
 
-    monkeypatch.setattr("vinemap.survey.write_index", faulty)
+    monkeypatch.setattr("vinemap.jobs.survey.write_index", faulty)
     said = pytest.warns(RuntimeWarning, match=r"index\.html can't be written: a fault .*of the page")
     with said:
         (outcome,) = job(cloud, tmp_path, boundaries=boundaries, parcels=["nobody's"])
@@ -302,7 +302,7 @@ def test_a_fault_in_the_page_hides_no_outcome_nor_error(cloud, boundaries, tmp_p
         raise InputError("the cloud is broken")
         yield
 
-    monkeypatch.setattr("vinemap.survey._work", broken)
+    monkeypatch.setattr("vinemap.jobs.survey._work", broken)
     with said, pytest.raises(InputError, match="the cloud is broken"):
         list(job(cloud, tmp_path, boundaries=boundaries, parcels=["A"]))
     assert json.loads(paths.survey_record(tmp_path).read_text())["parcels"][0]["state"] == FAILED

@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 from systems import LINUX, POSIX
 
-from vinemap import workers
 from vinemap.errors import BusyError, InputError, WorkerError
-from vinemap.workers import Worker, Workers
+from vinemap.jobs import workers
+from vinemap.jobs.workers import Worker, Workers
 
 SOON = 5.0
 """Seconds."""
@@ -76,7 +76,7 @@ def test_calls_run_one_after_the_other_in_one_process(worker):
 
 def test_how_many_cores_it_takes():
     with Workers(1, cores=3) as one:
-        assert one.run(eval, "__import__('vinemap.machine').machine.cores()") == 3
+        assert one.run(eval, "__import__('vinemap.compute.machine').machine.cores()") == 3
 
 
 HANGS = {
@@ -317,7 +317,7 @@ def test_no_process_can_be_started(own, monkeypatch, what):
         raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"vinemap.workers.{what}", fail)
+        patch.setattr(f"vinemap.jobs.workers.{what}", fail)
         with pytest.raises(WorkerError, match=r"^no process can be started \(Cannot allocate memory\)$") as error:
             own.run(pow, 2, 2)
     assert error.value.heals
@@ -341,7 +341,7 @@ def test_not_all_processes_can_be_started(monkeypatch):
 
 PARENT = """
 import sys, threading
-from vinemap.workers import Workers
+from vinemap.jobs.workers import Workers
 workers = Workers(2)
 for code in ("import time; time.sleep(600)", "while True: pass"):
     threading.Thread(target=workers.run, args=(exec, code), daemon=True).start()

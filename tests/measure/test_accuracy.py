@@ -12,12 +12,12 @@ import shapely.affinity
 import shapely.ops
 from click.testing import CliRunner
 
-from vinemap.accuracy import CANOPY_COLUMNS, COLUMNS, compare, main, measure, pool, table
+from vinemap.geo.raster import Grid, Raster, RowField
+from vinemap.measure.accuracy.rows import CANOPY_COLUMNS, COLUMNS, compare, main, measure, pool, table
+from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.parcel import RowMap
-from vinemap.raster import Grid, Raster, RowField
-from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Vineyard, simulate
-from vinemap.tables import as_markdown, as_text, fill
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Vineyard, simulate
 
 AZIMUTH, SPACING = 40.0, 2.4
 
@@ -201,8 +201,8 @@ def test_a_family_is_measured_and_drawn(tmp_path):
 
 def test_the_command():
     run = subprocess.run(
-        [sys.executable, "-m", "vinemap.accuracy", "short", "--seeds", "1", "--markdown"],
-        cwd=Path(__file__).parents[1],
+        [sys.executable, "-m", "vinemap.measure.accuracy.rows", "short", "--seeds", "1", "--markdown"],
+        cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
         check=True,

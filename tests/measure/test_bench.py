@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from vinemap import bench, bench_jobs, processes
-from vinemap.bench import Bar, Run
+from vinemap.compute import processes
 from vinemap.errors import ConfigError, VinemapError
+from vinemap.measure.bench import jobs as bench_jobs
+from vinemap.measure.bench import runs as bench
+from vinemap.measure.bench.runs import Bar, Run
 
 SECONDS = {"Reading": 1.0, "DTM": 2.0, "Curves": 0.5, "Ends and gaps": 0.25, "Mesh": 0.0, "Writing": 1.0, "All": 5.0}
 
@@ -140,7 +142,7 @@ def test_the_document_is_filled(tmp_path):
 
 
 def test_the_page_has_a_place_for_every_table():
-    page = (Path(__file__).parents[1] / "docs" / "speed.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "speed.md").read_text(encoding="utf-8")
     for name in ("machine", "bars", "stages", "many", "instead", "prefect"):
         assert page.count(f"<!-- {name} -->") == page.count(f"<!-- /{name} -->") == 1
 

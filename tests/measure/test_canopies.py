@@ -5,12 +5,12 @@ import pandas as pd
 import pytest
 import shapely
 
-from vinemap.canopy_accuracy import compare_canopies, pool_canopies
-from vinemap.cloud import Sections
+from vinemap.canopy.numbers import measure_sections, tabulate_sections
+from vinemap.cloud.points import Sections
+from vinemap.measure.accuracy.canopies import compare_canopies, pool_canopies
 from vinemap.parcel import CanopyModel, RowMap
-from vinemap.scenes import hillside, rows_of
-from vinemap.section_table import measure_sections, tabulate_sections
-from vinemap.synthetic import Vineyard, foliage_outlines, simulate
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Vineyard, foliage_outlines, simulate
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import pytest
 from click.testing import CliRunner
 
 from vinemap.errors import InputError
-from vinemap.odometry_accuracy import main
-from vinemap.odometry_tables import drift_table, loss_table, mark, size_table, terrain_tables
-from vinemap.odometry_trials import (
+from vinemap.measure.odometry import main
+from vinemap.measure.odometry.tables import drift_table, loss_table, mark, size_table, terrain_tables
+from vinemap.measure.odometry.trials import (
     FAILURE,
     METHODS,
     Drift,
@@ -22,9 +22,9 @@ from vinemap.odometry_trials import (
     template_error,
     template_offset,
 )
-from vinemap.poses import STILL, Pose
-from vinemap.virtual_camera import HIGH, LOW, PIECE, lay_ground
-from vinemap.virtual_steps import beyond, unrelated, walk
+from vinemap.odometry.poses import STILL, Pose
+from vinemap.simulate.camera import HIGH, LOW, PIECE, lay_ground
+from vinemap.simulate.steps import beyond, unrelated, walk
 
 
 def errors(place, turn, flagged=None):
@@ -139,8 +139,8 @@ def photograph(tmp_path):
 
 
 def test_tables_plots_and_the_document_are_filled(tmp_path, photograph, monkeypatch):
-    monkeypatch.setattr("vinemap.odometry_accuracy.MADE", ())
-    monkeypatch.setattr("vinemap.odometry_accuracy.PHOTOGRAPHS", ("brick",))
+    monkeypatch.setattr("vinemap.measure.odometry.MADE", ())
+    monkeypatch.setattr("vinemap.measure.odometry.PHOTOGRAPHS", ("brick",))
     docs = tmp_path / "page.md"
     docs.write_text("<!-- places -->\n<!-- /places -->\n<!-- lost 5000 -->\nkept\n<!-- /lost 5000 -->\n", "utf-8")
     options = ["--steps", "2", "--pairs", "5", "--out", str(tmp_path / "plots"), "--docs", str(docs)]

@@ -3,9 +3,9 @@
 import numpy as np
 from matplotlib.image import imread
 
+from vinemap.measure.picture import draw
 from vinemap.parcel import map_parcel
-from vinemap.picture import draw
-from vinemap.synthetic import write_survey
+from vinemap.simulate.survey import write_survey
 
 
 def test_both_halves_are_drawn(vineyard, tmp_path):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from vinemap.config.settings import Settings
+from vinemap.measure.tune import BOUNDS, main, reference_model, score, search, some_rows
 from vinemap.parcel import map_rows
-from vinemap.settings import Settings
-from vinemap.synthetic import write_survey
-from vinemap.tune import BOUNDS, main, reference_model, score, search, some_rows
+from vinemap.simulate.survey import write_survey
 
 
 @pytest.fixture(scope="module")

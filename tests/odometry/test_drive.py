@@ -15,13 +15,13 @@ import shapely
 from drives import images, poses
 from pyproj import Geod
 
-from vinemap.camera import Camera
-from vinemap.crs import Start
-from vinemap.drive import map_drive
+from vinemap.config.camera import Camera
 from vinemap.errors import InputError, OutputError
-from vinemap.poses import moved
-from vinemap.vector import TRACK_LAYERS
-from vinemap.virtual_camera import LOW
+from vinemap.geo.crs import Start
+from vinemap.odometry.drive import map_drive
+from vinemap.odometry.poses import moved
+from vinemap.product.geopackage import TRACK_LAYERS
+from vinemap.simulate.camera import LOW
 
 N = 12
 START = Start(44.61167, 7.92442, 72.5)
@@ -200,7 +200,7 @@ def test_a_start_elsewhere_is_told(recording, rows, tmp_path):
 
 
 def vinemap(folder, *args):
-    command = [sys.executable, "-c", "from vinemap.cli import main; main()", *map(str, args)]
+    command = [sys.executable, "-c", "from vinemap.cli.main import main; main()", *map(str, args)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
 
 
@@ -244,7 +244,7 @@ def test_drives_in_one_job(recording, tmp_path):
         f"  good: {{frames: ['{recording}'], start: [44.61167, 7.92442, 72.5]}}\n"
     )
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONPATH": str(Path(__file__).parents[2])}
     command = [sys.executable, "-m", "flows.odometry", "drives.yaml"]
     done = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300, env=environment

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from drives import ground, images, poses
 
-from vinemap.camera import Camera
+from vinemap.config.camera import Camera
 from vinemap.errors import InputError
-from vinemap.frames import read_recording, time_of
-from vinemap.odometry import estimate_motion
-from vinemap.poses import moved
-from vinemap.virtual_camera import LOW, Weather, render
+from vinemap.odometry.frames import read_recording, time_of
+from vinemap.odometry.poses import moved
+from vinemap.odometry.step import estimate_motion
+from vinemap.simulate.camera import LOW, Weather, render
 
 N = 6
 NUMBERS = (1, 2, 9, 10, 11, 100)

@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from vinemap.camera import Camera
+from vinemap.config.camera import Camera
 from vinemap.errors import InputError
-from vinemap.odometry import estimate_motion
-from vinemap.odometry_trials import template_error
-from vinemap.poses import Pose, moved
-from vinemap.virtual_camera import HIGH, LOW, Ground, Weather, lay_ground, render, rough, wander
+from vinemap.measure.odometry.trials import template_error
+from vinemap.odometry.poses import Pose, moved
+from vinemap.odometry.step import estimate_motion
+from vinemap.simulate.camera import HIGH, LOW, Ground, Weather, lay_ground, render, rough, wander
 
 SIZE = (1000, 1000)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from drives import frames, ground, images, poses
 
-from vinemap.camera import Camera
-from vinemap.poses import Pose, moved
-from vinemap.track import follow, stretches
-from vinemap.virtual_camera import LOW, Weather, render
+from vinemap.config.camera import Camera
+from vinemap.odometry.poses import Pose, moved
+from vinemap.odometry.track import follow, stretches
+from vinemap.simulate.camera import LOW, Weather, render
 
 N = 14
 

@@ -268,7 +268,7 @@ def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):
     folder.mkdir()
     odd = f"<img src=x onerror=alert(1)></script>{'/folder' * 30}"
     paths.survey_record(folder).write_text(json.dumps({"parcels": [{"parcel": odd, "state": "failed", "reason": odd}]}))
-    from vinemap.index import write_index
+    from vinemap.product.pages.survey import write_index
 
     assert write_index(folder, "</title><script>alert(2)</script>")
     browser = open_page(Path(paths.index(folder)))

@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.vector import LAYERS, conform, read_boundary, read_parcels, write_geopackage
+from vinemap.product.geopackage import LAYERS, conform, read_boundary, read_parcels, write_geopackage
 
 CONTRACT = {
     "rows": (

@@ -14,13 +14,13 @@ import trimesh
 from pyproj import CRS, Transformer
 
 from vinemap import paths
-from vinemap.config import survey_config
-from vinemap.crs import to_wgs84
-from vinemap.geoid import find_geoid
-from vinemap.globe import parcel_tileset, survey_tileset
-from vinemap.mesh import Mesh, loft, write_glb
-from vinemap.settings import Settings
-from vinemap.survey import _write_tileset, map_survey
+from vinemap.canopy.mesh import Mesh, loft, write_glb
+from vinemap.config.settings import Settings
+from vinemap.config.surveys import survey_config
+from vinemap.geo.crs import to_wgs84
+from vinemap.geo.geoid import find_geoid
+from vinemap.jobs.survey import _write_tileset, map_survey
+from vinemap.product.globe import parcel_tileset, survey_tileset
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 """What a reader of 3D Tiles does to glTF."""

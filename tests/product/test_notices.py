@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 import shapely
 
-from vinemap.notices import notices
-from vinemap.raster import Grid, Raster
+from vinemap.geo.raster import Grid, Raster
+from vinemap.product.notices import notices
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0

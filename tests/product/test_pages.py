@@ -20,13 +20,13 @@ import shapely
 from rasterio.io import MemoryFile
 
 from vinemap import paths
-from vinemap.index import find_earlier, read_products, write_index
-from vinemap.page import page
-from vinemap.raster import Grid, Raster
-from vinemap.report import SHADES, canopy_picture, profiles
-from vinemap.scenes import rows_of
+from vinemap.geo.raster import Grid, Raster
+from vinemap.product.pages.page import page
+from vinemap.product.pages.parcel import SHADES, canopy_picture, profiles
+from vinemap.product.pages.survey import find_earlier, read_products, write_index
+from vinemap.simulate.scenes import rows_of
 
-WEB = Path(paths.__file__).parent / "web"
+WEB = Path(paths.__file__).parent / "product" / "pages" / "web"
 
 
 class Page(HTMLParser):

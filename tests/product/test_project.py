@@ -9,9 +9,9 @@ import pytest
 import shapely
 
 from vinemap.parcel import map_parcel
-from vinemap.print_layout import MAP, map_scale, print_layout
-from vinemap.scenes import PLACE, hillside
-from vinemap.synthetic import Vineyard, simulate, write_survey
+from vinemap.product.qgis.print_layout import MAP, map_scale, print_layout
+from vinemap.simulate.scenes import PLACE, hillside
+from vinemap.simulate.survey import Vineyard, simulate, write_survey
 
 
 @pytest.fixture(scope="module")

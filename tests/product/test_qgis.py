@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from drives import images, poses
 
-from vinemap.crs import Start
-from vinemap.drive import map_drive
+from vinemap.geo.crs import Start
+from vinemap.odometry.drive import map_drive
 from vinemap.parcel import map_parcel
-from vinemap.synthetic import write_survey
-from vinemap.virtual_camera import LOW
+from vinemap.simulate.camera import LOW
+from vinemap.simulate.survey import write_survey
 
-OPEN = Path(__file__).with_name("open_in_qgis.py")
-PICTURES = Path(__file__).parents[1] / "build" / "qgis"
+OPEN = Path(__file__).parents[1] / "open_in_qgis.py"
+PICTURES = Path(__file__).parents[2] / "build" / "qgis"
 PYTHONS = [os.environ.get("QGIS_PYTHON"), "/usr/bin/python3"]
 """Pythons that QGIS may be installed for, an own choice first."""
 

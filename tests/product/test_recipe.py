@@ -13,11 +13,11 @@ import pytest
 import shapely
 from systems import POSIX
 
-from vinemap import recipe
-from vinemap.crs import Origin, parse_crs
+from vinemap.config.settings import Settings
 from vinemap.errors import BusyError, InputError
-from vinemap.recipe import Source, flown, product_in, read_source, recipe_of
-from vinemap.settings import Settings
+from vinemap.geo.crs import Origin, parse_crs
+from vinemap.product import recipe
+from vinemap.product.recipe import Source, flown, product_in, read_source, recipe_of
 
 PLACE = np.array([414_700.0, 4_940_700.0])
 

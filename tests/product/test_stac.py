@@ -19,12 +19,12 @@ from pystac.extensions.projection import ProjectionExtension
 from pystac.validation import JsonSchemaSTACValidator
 
 from vinemap import paths
-from vinemap.crs import WGS84, project
+from vinemap.geo.crs import WGS84, project
+from vinemap.geo.raster import Grid, Raster, write_cog
 from vinemap.parcel import map_parcel
-from vinemap.raster import Grid, Raster, write_cog
-from vinemap.recipe import read_source
-from vinemap.stac import parcel_item, save, write_collection
-from vinemap.synthetic import write_survey
+from vinemap.product.recipe import read_source
+from vinemap.product.stac import parcel_item, save, write_collection
+from vinemap.simulate.survey import write_survey
 
 RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 UTM = CRS.from_epsg(32632)

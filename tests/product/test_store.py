@@ -14,9 +14,10 @@ from types import SimpleNamespace
 import pytest
 from systems import LINUX, POSIX
 
-from vinemap import paths, store
-from vinemap.config import LONGEST_NAME, MOST_BYTES, check_name
+from vinemap import paths
+from vinemap.config.surveys import LONGEST_NAME, MOST_BYTES, check_name
 from vinemap.errors import BusyError, OutputError
+from vinemap.product import store
 
 
 def fill(folder, text="new", parcel="F", files=("F.gpkg", "F_dtm.tif")):
@@ -342,7 +343,7 @@ def test_a_lock_is_removed_while_it_is_held(tmp_path, monkeypatch):
 HOLD = """
 import sys
 from pathlib import Path
-from vinemap import store
+from vinemap.product import store
 folder = Path(sys.argv[1])
 with store.workshop(folder) as aside, store.product(folder / "F", drafts=aside, within=folder) as draft:
     (draft / "F.gpkg").write_text("half")

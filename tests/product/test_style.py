@@ -10,8 +10,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinemap.style import VIGOUR, alias, raster_style, vector_style
-from vinemap.symbology import classes_of, rgba
+from vinemap.product.qgis.style import VIGOUR, alias, raster_style, vector_style
+from vinemap.product.qgis.symbology import classes_of, rgba
 
 
 @pytest.mark.parametrize(

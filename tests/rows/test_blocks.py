@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import shapely
 
-from vinemap.blocks import group_blocks, outline_blocks
-from vinemap.confidence import judge_rows
-from vinemap.missing import count_missing, estimate_vine_spacing
+from vinemap.rows.blocks import group_blocks, outline_blocks
+from vinemap.rows.confidence import judge_rows
+from vinemap.rows.missing import count_missing, estimate_vine_spacing
 
 
 def rows_frame(lines, spacing=2.5, **columns):

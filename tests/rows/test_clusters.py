@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from vinemap.clustering import cluster_rows, ellipse_graph
+from vinemap.rows.clusters import cluster_rows, ellipse_graph
 
 
 def literal_clusters(xy, direction, along, across):

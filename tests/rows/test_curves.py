@@ -8,10 +8,10 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.cloud import PointCloud
-from vinemap.curves import order_key_points, trace_rows
-from vinemap.raster import Grid, Raster
-from vinemap.row_fit import fit_rows
+from vinemap.cloud.points import PointCloud
+from vinemap.geo.raster import Grid, Raster
+from vinemap.rows.curves import order_key_points, trace_rows
+from vinemap.rows.fit import fit_rows
 
 UTM = CRS.from_epsg(32632)
 

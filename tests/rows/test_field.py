@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from vinemap.cloud import PointCloud
-from vinemap.cover import canopy_cover
-from vinemap.crs import parse_crs
-from vinemap.ground import terrain_model
-from vinemap.raster import Grid, Raster, grid_over
-from vinemap.row_field import estimate_row_field
-from vinemap.scenes import hillside, rows_of
-from vinemap.synthetic import Obstacle, Vineyard, simulate
+from vinemap.cloud.points import PointCloud
+from vinemap.geo.crs import parse_crs
+from vinemap.geo.raster import Grid, Raster, grid_over
+from vinemap.rows.field import estimate_row_field
+from vinemap.simulate.scenes import hillside, rows_of
+from vinemap.simulate.survey import Obstacle, Vineyard, simulate
+from vinemap.surfaces.cover import canopy_cover
+from vinemap.surfaces.ground import terrain_model
 
 UTM = CRS.from_epsg(32632)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from vinemap.cloud import PointCloud
-from vinemap.row_frame import between, extend, points_of_rows, resample, runs_above, way_along, whittaker
+from vinemap.cloud.points import PointCloud
+from vinemap.rows.frame import between, extend, points_of_rows, resample, runs_above, way_along, whittaker
 
 
 def row_coordinates(xyz, curves, reach):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from vinemap.key_points import central_points, detect_key_points
-from vinemap.raster import Grid, Raster, RowField
+from vinemap.geo.raster import Grid, Raster, RowField
+from vinemap.rows.key_points import central_points, detect_key_points
 
 UTM = CRS.from_epsg(32632)
 

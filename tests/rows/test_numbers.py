@@ -9,13 +9,13 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.blocks import group_blocks
-from vinemap.crs import Origin, from_wgs84
-from vinemap.row_table import describe_rows, number_rows
+from vinemap.geo.crs import Origin, from_wgs84
+from vinemap.rows.blocks import group_blocks
+from vinemap.rows.numbers import describe_rows, number_rows
 
 UTM = CRS.from_epsg(32632)
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
-TABLE = pd.read_csv(Path(__file__).parents[1] / "data" / "table_2_1.csv")
+TABLE = pd.read_csv(Path(__file__).parents[2] / "data" / "table_2_1.csv")
 
 
 def frame(lines, spacing=2.5):

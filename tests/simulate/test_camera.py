@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vinemap.poses import Pose, moved
-from vinemap.virtual_camera import (
+from vinemap.odometry.poses import Pose, moved
+from vinemap.simulate.camera import (
     HIGH,
     LOW,
     RESOLUTION,
@@ -103,9 +103,9 @@ def test_the_edge_of_the_ground_is_no_ground():
 
 
 def test_a_recording_to_try_things_on(tmp_path):
-    from vinemap.config import load_camera
-    from vinemap.frames import read_recording
-    from vinemap.virtual_drive import BEGUN, record
+    from vinemap.config.surveys import load_camera
+    from vinemap.odometry.frames import read_recording
+    from vinemap.simulate.drive import BEGUN, record
 
     robot = [Pose(k * 30.0 - 950, 0, 0) for k in range(3)]
     laid = lay_ground("soil", size_mm=(600, 500))

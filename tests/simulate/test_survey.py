@@ -10,8 +10,8 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.crs import to_main
-from vinemap.scenes import (
+from vinemap.geo.crs import to_main
+from vinemap.simulate.scenes import (
     PLACE,
     TABLE_2_1,
     TABLE_2_1_ORIGIN,
@@ -22,7 +22,7 @@ from vinemap.scenes import (
     surface_through,
     terraced,
 )
-from vinemap.synthetic import Obstacle, Vineyard, simulate, write_survey
+from vinemap.simulate.survey import Obstacle, Vineyard, simulate, write_survey
 
 SLOPE = hillside(0.2, uphill=120, seed=4)
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from vinemap.cloud import PointCloud
-from vinemap.crs import parse_crs
+from vinemap.cloud.points import PointCloud
 from vinemap.errors import InputError
-from vinemap.ground import canopy_height_model, terrain_model
-from vinemap.raster import sample
-from vinemap.scenes import hillside, rows_of, terraced
-from vinemap.synthetic import Obstacle, Vineyard, simulate
+from vinemap.geo.crs import parse_crs
+from vinemap.geo.raster import sample
+from vinemap.simulate.scenes import hillside, rows_of, terraced
+from vinemap.simulate.survey import Obstacle, Vineyard, simulate
+from vinemap.surfaces.ground import canopy_height_model, terrain_model
 
 UTM = parse_crs("EPSG:32632")
 

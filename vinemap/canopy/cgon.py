@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.compute.threads import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud, Sections
+    from vinemap.cloud.points import PointCloud, Sections
 
     Values = NDArray[np.floating]
 

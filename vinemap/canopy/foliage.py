@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.cloud import NO_SECTIONS
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.mesh import Mesh, loft, merge
+from vinemap.canopy.mesh import Mesh, loft, merge
+from vinemap.cloud.points import NO_SECTIONS
+from vinemap.compute.threads import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.cloud import Sections
+    from vinemap.cloud.points import Sections
 
     Values = NDArray[np.floating]
     Flags = NDArray[np.bool_]

@@ -11,7 +11,7 @@ import numpy as np
 
 import vinemap
 from vinemap.errors import DependencyError
-from vinemap.json_values import jsonable
+from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

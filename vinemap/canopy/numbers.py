@@ -8,13 +8,13 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.compute.threads import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.cloud import Sections
+    from vinemap.cloud.points import Sections
 
     Values = NDArray[np.floating]
 

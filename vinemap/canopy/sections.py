@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.cloud import Sections
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import sample
-from vinemap.row_frame import at, points_of_rows, tangents
+from vinemap.cloud.points import Sections
+from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.geo.raster import sample
+from vinemap.rows.frame import at, points_of_rows, tangents
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
-    from vinemap.raster import Raster
-    from vinemap.row_frame import Taken
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.points import PointCloud
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.geo.raster import Raster
+    from vinemap.rows.frame import Taken
 
     Values = NDArray[np.floating]
 

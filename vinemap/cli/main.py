@@ -31,7 +31,7 @@ class _Origin(click.ParamType):  # type: ignore[type-arg]
     name = "LAT,LON,ALT"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from vinemap.crs import Origin, check_origin
+        from vinemap.geo.crs import Origin, check_origin
 
         try:
             lat, lon, alt = (float(part) for part in str(value).split(","))
@@ -46,7 +46,7 @@ class _Start(click.ParamType):  # type: ignore[type-arg]
     name = "LAT,LON,HEADING"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from vinemap.crs import Start, check_start
+        from vinemap.geo.crs import Start, check_start
 
         try:
             start = Start(*(float(part) for part in str(value).split(",")))
@@ -88,9 +88,9 @@ def run(
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
     from vinemap import paths
-    from vinemap.config import check_name, load_settings
-    from vinemap.crs import parse_crs
-    from vinemap.settings import Settings
+    from vinemap.config.settings import Settings
+    from vinemap.config.surveys import check_name, load_settings
+    from vinemap.geo.crs import parse_crs
 
     name = check_name(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
@@ -137,9 +137,9 @@ def survey(
 ) -> None:
     """Map many parcels of CLOUD (LAS, LAZ or COPC) in one job; exit code 1 if one of them fails."""
     from vinemap import paths
-    from vinemap.config import load_settings, survey_config
-    from vinemap.plan import FAILED
-    from vinemap.survey import map_survey
+    from vinemap.config.surveys import load_settings, survey_config
+    from vinemap.jobs.plan import FAILED
+    from vinemap.jobs.survey import map_survey
 
     name = paths.stem(cloud)
     config = survey_config(
@@ -168,7 +168,7 @@ def config(kind: str) -> None:
     KIND is what the file is for: the surveys of an estate night after night, one survey, the stages alone, or the
     camera of a robot.
     """
-    from vinemap.template import template
+    from vinemap.config.template import template
 
     click.echo(template(kind), nl=False)
 
@@ -181,8 +181,8 @@ def config(kind: str) -> None:
 @click.option("--pairs", type=FILE, help="GeoPackage to write: matched, extra and missed rows with their indices.")
 def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None, pairs: Path | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
-    from vinemap.evaluate import as_layer, evaluate_rows, format_table, read_lines
-    from vinemap.vector import write_layer
+    from vinemap.evaluate.rows import as_layer, evaluate_rows, format_table, read_lines
+    from vinemap.product.geopackage import write_layer
 
     found, drawn = read_lines(result), read_lines(reference, layer, parcel=parcel)
     evaluation = evaluate_rows(found, drawn)
@@ -247,8 +247,8 @@ def track(
     method: Any,
 ) -> None:
     """Follow a robot by the FRAMES of its camera that looks down: images, folders of images, or videos, in order."""
-    from vinemap.config import load_camera
-    from vinemap.drive import map_drive
+    from vinemap.config.surveys import load_camera
+    from vinemap.odometry.drive import map_drive
 
     summary = map_drive(
         frames,

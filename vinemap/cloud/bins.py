@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import cell_of
+from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.geo.raster import cell_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.raster import Grid
+    from vinemap.geo.raster import Grid
 
     Values = NDArray[np.floating]
     Indices = NDArray[np.int32]

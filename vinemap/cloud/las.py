@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.compiled import ahead
-from vinemap.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
+from vinemap.cloud.tiles import Collector
+from vinemap.cloud.zones import deal, zones_of
+from vinemap.compute.threads import ahead
 from vinemap.errors import PASSING, BusyError, InputError, OutsideError
-from vinemap.tiles import Collector
-from vinemap.zones import deal, zones_of
+from vinemap.geo.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.cloud import PointCloud
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.points import PointCloud
+    from vinemap.cloud.tiles import Cloud
 
     Points = NDArray[np.float64]
     Box = tuple[Points, Points]

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.cloud import PointCloud
-from vinemap.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
+from vinemap.cloud.las import OURS, boundary_in, collected, is_copc, opened, unreadable
+from vinemap.cloud.points import PointCloud
+from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
-from vinemap.las import OURS, boundary_in, collected, is_copc, opened, unreadable
-from vinemap.tiles import Collector
+from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.las import Boundary
+    from vinemap.cloud.las import Boundary
 
 USABLE = "Classification != 7 && Classification != 18 && Withheld == 0"
 """Points that are neither noise nor withheld, as PDAL writes it."""
@@ -72,7 +72,7 @@ def pdal_versions() -> dict[str, str]:
 
 
 def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None) -> PointCloud:
-    """Read a LAS, LAZ or COPC file as :func:`vinemap.las.read_cloud` does, with PDAL, and classify its ground.
+    """Read a LAS, LAZ or COPC file as :func:`vinemap.cloud.las.read_cloud` does, with PDAL, and classify its ground.
 
     Parameters and what else is raised are those of that function.
 

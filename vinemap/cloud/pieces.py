@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap.cloud.las import boundary_in, collected, open_cloud
+from vinemap.cloud.zones import deal, zones_of
 from vinemap.errors import InputError
-from vinemap.las import boundary_in, collected, open_cloud
-from vinemap.zones import deal, zones_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.las import Boundary
-    from vinemap.tiles import Cloud, Collector
+    from vinemap.cloud.las import Boundary
+    from vinemap.cloud.tiles import Cloud, Collector
 
 CHUNK = 1_000_000
 """Points that are read back at once."""
@@ -56,7 +56,7 @@ def split_cloud(
     Raises
     ------
     InputError
-        If the file can't be read, as in :func:`vinemap.las.read_cloud`.
+        If the file can't be read, as in :func:`vinemap.cloud.las.read_cloud`.
     OSError
         If the folder is full.
     """

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.bins import bin_points
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import above, extent
+from vinemap.cloud.bins import bin_points
+from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.geo.raster import above, extent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.bins import Bins
-    from vinemap.raster import Grid, Raster
+    from vinemap.cloud.bins import Bins
+    from vinemap.geo.raster import Grid, Raster
 
     Values = NDArray[np.floating]
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap.cloud import PointCloud
-from vinemap.raster import extent, squares
+from vinemap.cloud.points import PointCloud
+from vinemap.geo.raster import extent, squares
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.raster import Raster
+    from vinemap.geo.raster import Raster
 
     Points = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Tile(NamedTuple):
 
 @dataclass(frozen=True)
 class TiledCloud:
-    """Points in tiles on disk: parts of a cloud, used as a :class:`vinemap.cloud.PointCloud` is.
+    """Points in tiles on disk: parts of a cloud, used as a :class:`vinemap.cloud.points.PointCloud` is.
 
     The edges of tiles are those of the rasters' cells, so that statistics of cells are the same as of the cloud whole.
     """

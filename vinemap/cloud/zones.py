@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from scipy.ndimage import binary_dilation
 
-from vinemap.compiled import compiled
-from vinemap.raster import Grid, window
+from vinemap.compute.threads import compiled
+from vinemap.geo.raster import Grid, window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from numba import njit
 
-from vinemap import machine
+from vinemap.compute import machine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

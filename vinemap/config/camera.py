@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from vinemap.settings import Options
+from vinemap.config.settings import Options
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 import yaml
 from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, model_validator
 
-from vinemap.camera import Camera
-from vinemap.crs import Origin, Start, check_origin, check_start, parse_crs
+from vinemap.config.camera import Camera
+from vinemap.config.settings import OdometryOptions, Options, Settings
 from vinemap.errors import ConfigError, InputError
+from vinemap.geo.crs import Origin, Start, check_origin, check_start, parse_crs
 from vinemap.paths import LONGEST_NAME, MOST_BYTES
-from vinemap.settings import OdometryOptions, Options, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

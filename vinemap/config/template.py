@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 import yaml
 from pydantic_core import PydanticUndefined
 
-from vinemap.camera import Camera
-from vinemap.config import EstateConfig, SurveyConfig
-from vinemap.settings import Options, Settings
+from vinemap.config.camera import Camera
+from vinemap.config.settings import Options, Settings
+from vinemap.config.surveys import EstateConfig, SurveyConfig
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.evaluate import match_rows
+from vinemap.evaluate.rows import match_rows
 
 if TYPE_CHECKING:
     import geopandas as gpd

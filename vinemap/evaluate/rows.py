@@ -21,8 +21,8 @@ from shapely.errors import ShapelyError
 from shapely.geometry import Point, Polygon
 from shapely.ops import substring
 
-from vinemap.crs import horizontal, metric_crs, vertical_unit
 from vinemap.errors import InputError
+from vinemap.geo.crs import horizontal, metric_crs, vertical_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

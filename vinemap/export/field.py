@@ -13,9 +13,9 @@ import shapely
 from pyogrio.errors import DataLayerError, DataSourceError
 
 from vinemap import paths
-from vinemap.crs import WGS84, Origin, to_main
 from vinemap.errors import InputError
-from vinemap.lanes import lanes_between
+from vinemap.export.lanes import lanes_between
+from vinemap.geo.crs import WGS84, Origin, to_main
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,7 +37,7 @@ class Field(NamedTuple):
     origin: Origin
     rows: gpd.GeoDataFrame
     lanes: gpd.GeoDataFrame
-    """Of :func:`vinemap.lanes.lanes_between`; empty if they weren't asked for."""
+    """Of :func:`vinemap.export.lanes.lanes_between`; empty if they weren't asked for."""
     row_ends: gpd.GeoDataFrame
     gaps: gpd.GeoDataFrame
     outline: gpd.GeoDataFrame

@@ -10,17 +10,17 @@ import numpy as np
 from pyproj import CRS
 
 from vinemap import paths
-from vinemap.crs import to_main
+from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
 from vinemap.export.meshes import place_canopies
-from vinemap.mesh import Mesh
-from vinemap.mesh_files import write_obj
+from vinemap.geo.crs import to_main
+from vinemap.product.gltf import write_obj
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vinemap.crs import Origin
     from vinemap.export.field import Field
+    from vinemap.geo.crs import Origin
 
 TERRAIN_CELL = 1.0
 """Metres, about, between the vertices of the terrain."""

@@ -8,15 +8,15 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.neighbours import STEP, aligned, belonging, look, pair_rows
-from vinemap.row_frame import extend, way_along
+from vinemap.export.neighbours import STEP, aligned, belonging, look, pair_rows
+from vinemap.rows.frame import extend, way_along
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.neighbours import Pair, Side
+    from vinemap.export.neighbours import Pair, Side
 
     Values = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap import paths
-from vinemap.crs import to_main
-from vinemap.mesh_files import read_glb, write_obj, write_ply
+from vinemap.geo.crs import to_main
+from vinemap.product.gltf import read_glb, write_obj, write_ply
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from vinemap.canopy.mesh import Mesh
     from vinemap.export.field import Field
-    from vinemap.mesh import Mesh
 
 
 class Placed(NamedTuple):

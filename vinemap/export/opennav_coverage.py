@@ -15,7 +15,7 @@ import shapely
 
 from vinemap import paths
 from vinemap.errors import InputError
-from vinemap.lanes import resampled
+from vinemap.export.lanes import resampled
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
-from vinemap import __version__, paths, store
+from vinemap import __version__, paths
 from vinemap.errors import InputError
 from vinemap.export import MESHES
 from vinemap.export.agopengps import write_agopengps
@@ -20,6 +20,7 @@ from vinemap.export.meshes import write_canopy
 from vinemap.export.nav2 import write_nav2
 from vinemap.export.opennav_coverage import write_opennav_coverage
 from vinemap.export.shapefile import write_shapefile
+from vinemap.product import store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -55,7 +56,7 @@ def export_products(
     lines : str
         What guidance is written of: "lanes", "rows" or "both".
     headland, outer, vertices
-        As for :func:`vinemap.lanes.lanes_between`; rows for opennav_coverage have as many vertices, too.
+        As for :func:`vinemap.export.lanes.lanes_between`; rows for opennav_coverage have as many vertices, too.
     frame, grid
         As for :func:`vinemap.export.opennav_coverage.write_opennav_coverage`.
 

@@ -11,7 +11,7 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from vinemap.crs import is_ellipsoidal, to_wgs84
+from vinemap.geo.crs import is_ellipsoidal, to_wgs84
 
 if TYPE_CHECKING:
     from collections.abc import Callable

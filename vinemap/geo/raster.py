@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from affine import Affine
 
-from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.compute.threads import compiled, in_threads, stretches
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:

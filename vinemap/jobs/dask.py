@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any, Self
 
-from vinemap import machine
+from vinemap.compute import machine
 from vinemap.errors import ConfigError, DependencyError, WorkerError
-from vinemap.workers import Worker
+from vinemap.jobs.workers import Worker
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,7 +58,7 @@ class DaskWorkers:
         self.slots = min(MOST_SLOTS, sum(self._client.nthreads().values()))
 
     def run(self, function: Callable[..., Any], *args: Any, limit: float | None = None, **kwargs: Any) -> Any:
-        """Run a function on the cluster as :meth:`vinemap.workers.Worker.run` does here."""
+        """Run a function on the cluster as :meth:`vinemap.jobs.workers.Worker.run` does here."""
         from distributed import CancelledError, KilledWorker
 
         job = self._client.submit(_run, function, args, kwargs, limit, self._memory, pure=False)

@@ -6,15 +6,15 @@ import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
-from vinemap.config import check_name
+from vinemap.cloud.las_end import unfinished
+from vinemap.config.surveys import check_name
 from vinemap.errors import InputError, VinemapError
-from vinemap.las_end import unfinished
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from vinemap.config import EstateConfig, SurveyConfig
+    from vinemap.config.surveys import EstateConfig, SurveyConfig
 
 CLOUDS = (".las", ".laz")
 POLYGONS = (".gpkg", ".geojson", ".shp")

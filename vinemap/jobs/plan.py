@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import __version__, paths
-from vinemap.config import check_name
-from vinemap.crs import parse_crs
+from vinemap.config.surveys import check_name
 from vinemap.errors import ConfigError, InputError
+from vinemap.geo.crs import parse_crs
 from vinemap.parcel import found
-from vinemap.recipe import Recipe, Source, flown, product_in, read_source
-from vinemap.store import write_whole
-from vinemap.vector import read_parcels
+from vinemap.product.geopackage import read_parcels
+from vinemap.product.recipe import Recipe, Source, flown, product_in, read_source
+from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from vinemap.config import SurveyConfig
-    from vinemap.las import Boundary
+    from vinemap.cloud.las import Boundary
+    from vinemap.config.surveys import SurveyConfig
 
 DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
 """What can become of a parcel."""

@@ -12,16 +12,17 @@ from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
-from vinemap import machine, paths
+from vinemap import paths
+from vinemap.cloud.pieces import split_cloud
+from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
-from vinemap.globe import survey_tileset
-from vinemap.index import write_index
+from vinemap.jobs.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
+from vinemap.jobs.workers import Worker, Workers
 from vinemap.parcel import call, follow
-from vinemap.pieces import split_cloud
-from vinemap.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
-from vinemap.stac import write_collection
-from vinemap.store import unwritable, workshop, write_whole
-from vinemap.workers import Worker, Workers
+from vinemap.product.globe import survey_tileset
+from vinemap.product.pages.survey import write_index
+from vinemap.product.stac import write_collection
+from vinemap.product.store import unwritable, workshop, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -31,15 +32,15 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.config import JobOptions, SurveyConfig
-    from vinemap.las import Boundary
+    from vinemap.cloud.las import Boundary
+    from vinemap.cloud.pieces import Piece
+    from vinemap.config.surveys import JobOptions, SurveyConfig
     from vinemap.parcel import Summary
-    from vinemap.pieces import Piece
-    from vinemap.recipe import Recipe
+    from vinemap.product.recipe import Recipe
 
 
 class Engine(Protocol):
-    """Takes calls from as many threads as it has slots, as :class:`vinemap.workers.Workers` does."""
+    """Takes calls from as many threads as it has slots, as :class:`vinemap.jobs.workers.Workers` does."""
 
     slots: int
 
@@ -134,7 +135,7 @@ def _engine(plan: Plan, config: SurveyConfig) -> AbstractContextManager[Engine]:
     """What runs the parcels."""
     job = config.job
     if job.engine == "dask":
-        from vinemap.dask_engine import DaskWorkers
+        from vinemap.jobs.dask import DaskWorkers
 
         return DaskWorkers(job.scheduler or "", memory=job.memory)
     n = min(job.workers or machine.most_processes(), len(plan.recipes))

@@ -22,8 +22,8 @@ import traceback
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
+from vinemap.compute.machine import use
 from vinemap.errors import VinemapError, WorkerError, own_fault
-from vinemap.machine import use
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,7 +34,9 @@ PR_SET_PDEATHSIG = 1
 """Of Linux's prctl(2)."""
 LENGTH = struct.Struct("<Q")
 """Of the number of bytes that stands before a message."""
-SERVE = "import sys; sys.path[:] = sys.argv[3:]; from vinemap.workers import serve; serve(*map(int, sys.argv[1:3]))"
+SERVE = (
+    "import sys; sys.path[:] = sys.argv[3:]; from vinemap.jobs.workers import serve; serve(*map(int, sys.argv[1:3]))"
+)
 KILLED = {"SIGKILL": "killed by the system, perhaps for want of memory", "SIGSEGV": "a segmentation fault"}
 
 

@@ -1,6 +1,6 @@
 """A picture of a product: its rows over the terrain and the canopies' height, and its meshes seen from above.
 
-``python -m vinemap.picture PRODUCT PARCEL FILE.png`` draws README's.
+``python -m vinemap.measure.picture PRODUCT PARCEL FILE.png`` draws README's.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
 
 from vinemap import paths
-from vinemap.mesh_files import read_glb
-from vinemap.style import CANOPY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
+from vinemap.product.gltf import read_glb
+from vinemap.product.qgis.style import CANOPY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

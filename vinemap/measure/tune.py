@@ -1,4 +1,4 @@
-"""Search of a model's [a, b, c] by its quality score, as in section 3.3: ``python -m vinemap.tune CLOUD``.
+"""Search of a model's [a, b, c] by its quality score, as in section 3.3: ``python -m vinemap.measure.tune CLOUD``.
 
 Every model is held against the foliage's outlines in fine, fixed sections (V_ref of Table 3.1): between its own
 sections its mesh runs straight, so that sections far apart are paid for. R follows the cloud's density, so that Q
@@ -15,14 +15,14 @@ import numpy as np
 import shapely
 from scipy.optimize import differential_evolution
 
-from vinemap.cli import FILE, plain_errors
-from vinemap.crs import parse_crs
+from vinemap.canopy.numbers import modelling_indices
+from vinemap.cli.main import FILE, plain_errors
+from vinemap.cloud.las import read_cloud
+from vinemap.config.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.errors import InputError
-from vinemap.las import read_cloud
+from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_rows, model_canopies
-from vinemap.section_table import modelling_indices
-from vinemap.settings import PolygonOptions, SectionOptions, Settings
-from vinemap.vector import read_boundary
+from vinemap.product.geopackage import read_boundary
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

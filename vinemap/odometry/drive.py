@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pyogrio
 import shapely
 
-from vinemap.crs import WGS84, metric_crs
 from vinemap.errors import InputError, OutputError
-from vinemap.evaluate import read_lines
-from vinemap.frames import read_recording
-from vinemap.odometry import ANGLES
-from vinemap.poses import STILL
-from vinemap.track import Fix, follow
-from vinemap.track_table import NOWHERE, beside_rows, track_layers
-from vinemap.vector import TRACK_LAYERS, write_geopackage
+from vinemap.evaluate.rows import read_lines
+from vinemap.geo.crs import WGS84, metric_crs
+from vinemap.odometry.frames import read_recording
+from vinemap.odometry.layers import NOWHERE, beside_rows, track_layers
+from vinemap.odometry.poses import STILL
+from vinemap.odometry.step import ANGLES
+from vinemap.odometry.track import Fix, follow
+from vinemap.product.geopackage import TRACK_LAYERS, write_geopackage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from pyproj import CRS
 
-    from vinemap.camera import Camera
-    from vinemap.crs import Start
-    from vinemap.frames import Frame
-    from vinemap.odometry import Method
+    from vinemap.config.camera import Camera
+    from vinemap.geo.crs import Start
+    from vinemap.odometry.frames import Frame
+    from vinemap.odometry.step import Method
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 
@@ -75,11 +75,11 @@ def map_drive(
     Parameters
     ----------
     recording : sequence of Path
-        Images, folders of images, and videos: see :func:`vinemap.frames.read_recording`.
+        Images, folders of images, and videos: see :func:`vinemap.odometry.frames.read_recording`.
     out : Path
         GeoPackage to write, in place of an earlier track.
     camera, template_share, angles, method
-        As for :func:`vinemap.odometry.estimate_motion`.
+        As for :func:`vinemap.odometry.step.estimate_motion`.
     start : Start, optional
         Where the first frame was taken; without it the track has no place on the map.
     rows : Path, optional

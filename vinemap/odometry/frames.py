@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.camera import Camera
+    from vinemap.config.camera import Camera
 
     Image = NDArray[np.uint8]
 

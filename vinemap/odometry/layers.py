@@ -11,18 +11,18 @@ import pandas as pd
 import shapely
 from pyproj import CRS
 
-from vinemap.crs import Origin, from_wgs84, main_to_wgs84, project
 from vinemap.errors import InputError
-from vinemap.poses import Pose, onward
-from vinemap.track import stretches
+from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, project
+from vinemap.odometry.poses import Pose, onward
+from vinemap.odometry.track import stretches
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.crs import Start
-    from vinemap.track import Fix
+    from vinemap.geo.crs import Start
+    from vinemap.odometry.track import Fix
 
 NOWHERE = CRS.from_wkt(
     'ENGCRS["Track: metres to the right of its start and ahead",EDATUM["start of the track"],CS[Cartesian,2],'
@@ -36,7 +36,7 @@ FARTHEST = 2000.0
 
 
 def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
-    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.vector.TRACK_LAYERS`, without rows.
+    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.product.geopackage.TRACK_LAYERS`, without rows.
 
     Parameters
     ----------

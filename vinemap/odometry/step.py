@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from vinemap.correlation import (
+from vinemap.errors import InputError
+from vinemap.odometry.correlation import (
     COARSE_STEP,
     Place,
     Search,
@@ -23,16 +24,15 @@ from vinemap.correlation import (
     search_of,
     warp,
 )
-from vinemap.errors import InputError
-from vinemap.poses import Pose, onward
+from vinemap.odometry.poses import Pose, onward
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.camera import Camera
-    from vinemap.correlation import Index
+    from vinemap.config.camera import Camera
+    from vinemap.odometry.correlation import Index
 
     Array = NDArray[np.floating]
     Image = NDArray[np.uint8]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
-from vinemap.odometry import ANGLES, LEAST_CONTRAST, expected_overlap, motion_between, view_of
-from vinemap.poses import STILL, Pose, moved, onward
+from vinemap.odometry.poses import STILL, Pose, moved, onward
+from vinemap.odometry.step import ANGLES, LEAST_CONTRAST, expected_overlap, motion_between, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from vinemap.camera import Camera
-    from vinemap.frames import Frame
-    from vinemap.odometry import Method, Motion, View
+    from vinemap.config.camera import Camera
+    from vinemap.odometry.frames import Frame
+    from vinemap.odometry.step import Method, Motion, View
 
 KEY_OVERLAP = 0.4
 """Share of a frame that a keyframe must have in common with the frames that are measured from it."""
@@ -30,7 +30,7 @@ class Fix(NamedTuple):
     score: float
     agreement: float
     overlap: float
-    """Of the step from the frame from which it was measured: see :class:`vinemap.odometry.Motion`."""
+    """Of the step from the frame from which it was measured: see :class:`vinemap.odometry.step.Motion`."""
     flag: str
     """Why it couldn't be measured; empty where it was. A flagged pose is carried on by the last movement."""
     measured_from: int | None
@@ -66,14 +66,14 @@ def follow(
     frames : iterable of Frame
         Each looked at once, and no more than three of them are kept.
     camera, template_share, angles, method
-        As for :func:`vinemap.odometry.estimate_motion`.
+        As for :func:`vinemap.odometry.step.estimate_motion`.
     keyframes : bool
         Whether frames are measured from keyframes, or each from the one before.
 
     Raises
     ------
     InputError
-        As for :func:`vinemap.odometry.estimate_motion`.
+        As for :func:`vinemap.odometry.step.estimate_motion`.
     """
 
     def measure(anchor: _Anchor, view: View, expected: Pose | None) -> Motion:

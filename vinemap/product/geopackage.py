@@ -18,7 +18,7 @@ import shapely
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap.errors import InputError, OutputError
-from vinemap.style import layer_styles
+from vinemap.product.qgis.style import layer_styles
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

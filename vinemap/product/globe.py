@@ -17,8 +17,8 @@ import numpy as np
 from pyproj import CRS
 
 import vinemap
-from vinemap.crs import to_wgs84, transformer
-from vinemap.geoid import find_geoid
+from vinemap.geo.crs import to_wgs84, transformer
+from vinemap.geo.geoid import find_geoid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from vinemap.geoid import Geoid
-    from vinemap.mesh import Mesh
+    from vinemap.canopy.mesh import Mesh
+    from vinemap.geo.geoid import Geoid
 
     Points = NDArray[np.float64]
 
@@ -78,14 +78,14 @@ def parcel_tileset(
     meshes : sequence of Mesh
         The canopies, in ``crs``.
     content : str
-        Name of the file beside the tileset that :func:`vinemap.mesh.write_glb` made of them. It turns Z up to Y up, as
-        glTF wants it; 3D Tiles turn that back, so that a tile's frame is east, north, up.
+        Name of the file beside the tileset that :func:`vinemap.product.gltf.write_glb` made of them. It turns Z up to
+        Y up, as glTF wants it; 3D Tiles turn that back, so that a tile's frame is east, north, up.
     origin : array_like of shape (3,)
         The file's.
     crs : CRS
         The horizontal, projected CRS.
     vertical, geoid : str, float, optional
-        As for :func:`vinemap.geoid.find_geoid`.
+        As for :func:`vinemap.geo.geoid.find_geoid`.
     """
     meshes = [mesh for mesh in meshes if len(mesh.faces)]
     if not meshes:

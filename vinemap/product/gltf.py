@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.crs import parse_crs
+from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
-from vinemap.mesh import Mesh
+from vinemap.geo.crs import parse_crs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,7 @@ class Canopies(NamedTuple):
 
 
 def read_glb(path: Path) -> Canopies:
-    """Read what :func:`vinemap.mesh.write_glb` wrote, quantised and in strips or plain.
+    """Read what :func:`vinemap.canopy.mesh.write_glb` wrote, quantised and in strips or plain.
 
     Raises
     ------

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from vinemap.raster import block_sum
+from vinemap.geo.raster import block_sum
 
 if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.raster import Grid, Raster
+    from vinemap.geo.raster import Grid, Raster
 
 SIDE = 2.0
 """Metres, about: side of the squares that points cover or don't."""

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import shapely
 
 from vinemap import __version__, paths
+from vinemap.cloud.las import date_of
+from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
-from vinemap.las import date_of
-from vinemap.settings import Settings
-from vinemap.vector import read_boundary
+from vinemap.product.geopackage import read_boundary
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.crs import Origin
-    from vinemap.las import Boundary
+    from vinemap.cloud.las import Boundary
+    from vinemap.geo.crs import Origin
 
 SETTLED = 2.0
 """Seconds within which a file can change twice without its time telling."""

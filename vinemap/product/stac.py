@@ -23,8 +23,8 @@ from pystac.extensions.file import FileExtension
 from pystac.extensions.projection import ProjectionExtension
 
 from vinemap import paths
-from vinemap.crs import WGS84, project
-from vinemap.store import write_whole
+from vinemap.geo.crs import WGS84, project
+from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -12,15 +12,15 @@ import numpy as np
 import shapely
 
 from vinemap import paths
-from vinemap.blocks import outline_blocks
-from vinemap.compiled import in_threads
-from vinemap.crs import project
-from vinemap.globe import parcel_tileset
-from vinemap.mesh import Mesh, write_glb
-from vinemap.project import project as qgis_project
-from vinemap.raster import Raster, RowField, write_cog
-from vinemap.style import raster_style
-from vinemap.vector import conform, write_geopackage
+from vinemap.canopy.mesh import Mesh, write_glb
+from vinemap.compute.threads import in_threads
+from vinemap.geo.crs import project
+from vinemap.geo.raster import Raster, RowField, write_cog
+from vinemap.product.geopackage import conform, write_geopackage
+from vinemap.product.globe import parcel_tileset
+from vinemap.product.qgis.project import project as qgis_project
+from vinemap.product.qgis.style import raster_style
+from vinemap.rows.blocks import outline_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.tiles import Cloud
 
     Boundary = tuple[shapely.Geometry, CRS]
 
@@ -103,7 +103,7 @@ def write_product(
     """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
 
     The ``date`` is the survey's. ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the
-    globe, m (:func:`vinemap.geoid.find_geoid`).
+    globe, m (:func:`vinemap.geo.geoid.find_geoid`).
 
     Raises
     ------

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from vinemap.compiled import compiled, in_threads, stretches
+from vinemap.compute.threads import compiled, in_threads, stretches
 
 if TYPE_CHECKING:
     import geopandas as gpd

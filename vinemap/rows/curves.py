@@ -15,9 +15,9 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vinemap.compiled import compiled, in_threads
-from vinemap.raster import Raster, sample_across
-from vinemap.row_frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
+from vinemap.compute.threads import compiled, in_threads
+from vinemap.geo.raster import Raster, sample_across
+from vinemap.rows.frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

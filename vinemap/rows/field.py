@@ -17,9 +17,9 @@ from scipy.fft import fft, irfft, rfft
 from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
-from vinemap.compiled import compiled, in_threads
-from vinemap.raster import Grid, Raster, RowField, coarser
-from vinemap.row_frame import at
+from vinemap.compute.threads import compiled, in_threads
+from vinemap.geo.raster import Grid, Raster, RowField, coarser
+from vinemap.rows.frame import at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,9 +17,9 @@ from scipy import sparse
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.sparse.linalg import spsolve
 
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import Raster, sample
-from vinemap.row_frame import (
+from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.geo.raster import Raster, sample
+from vinemap.rows.frame import (
     between,
     centre_line,
     half_width,
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
-    from vinemap.raster import Grid
-    from vinemap.row_frame import Taken
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.points import PointCloud
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.geo.raster import Grid
+    from vinemap.rows.frame import Taken
 
     Values = NDArray[np.floating]
 

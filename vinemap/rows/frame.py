@@ -8,17 +8,17 @@ import numpy as np
 import shapely
 from scipy.ndimage import gaussian_filter1d
 
-from vinemap.compiled import compiled, in_threads, stretches
-from vinemap.raster import grid_over
+from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.geo.raster import grid_over
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud import PointCloud
-    from vinemap.raster import Grid
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.points import PointCloud
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.geo.raster import Grid
 
     Values = NDArray[np.floating]
 

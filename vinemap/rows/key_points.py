@@ -8,13 +8,13 @@ import geopandas as gpd
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from vinemap.compiled import in_threads
-from vinemap.raster import cell_of, sample, sample_across
+from vinemap.compute.threads import in_threads
+from vinemap.geo.raster import cell_of, sample, sample_across
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.raster import Grid, Raster, RowField
+    from vinemap.geo.raster import Grid, Raster, RowField
 
     Values = NDArray[np.floating]
 

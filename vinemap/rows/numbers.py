@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.crs import WGS84, to_main, to_wgs84
+from vinemap.geo.crs import WGS84, to_main, to_wgs84
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.crs import Origin
+    from vinemap.geo.crs import Origin
 
     Values = NDArray[np.float64]
 

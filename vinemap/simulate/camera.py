@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.camera import Camera
+from vinemap.config.camera import Camera
 from vinemap.errors import DependencyError, InputError
-from vinemap.poses import Pose
+from vinemap.odometry.poses import Pose
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

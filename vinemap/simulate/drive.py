@@ -1,4 +1,4 @@
-"""A recording to try ``vinemap track`` on: ``python -m vinemap.virtual_drive FOLDER``."""
+"""A recording to try ``vinemap track`` on: ``python -m vinemap.simulate.drive FOLDER``."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import click
 import yaml
 
 from vinemap import paths
-from vinemap.cli import frame_progress, plain_errors
-from vinemap.poses import Pose
-from vinemap.virtual_camera import LOW, MADE, PHOTOGRAPHS, lay_ground, render, sinusoid
+from vinemap.cli.main import frame_progress, plain_errors
+from vinemap.odometry.poses import Pose
+from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground, render, sinusoid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vinemap.virtual_camera import Ground
+    from vinemap.simulate.camera import Ground
 
 BEGUN = 1_778_745_600
 """Seconds since 1970 of the first frame: 14 May 2026, 8 h UTC."""

@@ -14,17 +14,17 @@ from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 from shapely.ops import substring
 
-from vinemap.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
-from vinemap.synthetic import Obstacle, Survey, Vineyard, simulate, waves
+from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
+from vinemap.simulate.survey import Obstacle, Survey, Vineyard, simulate, waves
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vinemap.synthetic import Array, Terrain
+    from vinemap.simulate.survey import Array, Terrain
 
 PLACE = (414750.0, 4940780.0)
 """Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
-TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
+TABLE_2_1 = Path(__file__).parents[2] / "data" / "table_2_1.csv"
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6
 """How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.poses import Pose, moved
-from vinemap.virtual_camera import LOW, above, lay_ground, render, rough, wander
+from vinemap.odometry.poses import Pose, moved
+from vinemap.simulate.camera import LOW, above, lay_ground, render, rough, wander
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from vinemap.camera import Camera
-    from vinemap.virtual_camera import Ground, Image
+    from vinemap.config.camera import Camera
+    from vinemap.simulate.camera import Ground, Image
 
     Step = tuple[Image, Image, Pose]
     """Two frames and the movement between them."""

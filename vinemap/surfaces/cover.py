@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.compiled import compiled, in_threads
-from vinemap.raster import Raster, block_sum, cell_of, grid_over
+from vinemap.compute.threads import compiled, in_threads
+from vinemap.geo.raster import Raster, block_sum, cell_of, grid_over
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.tiles import Cloud
 
     Values = NDArray[np.floating]
     Counts = NDArray[np.uint16]

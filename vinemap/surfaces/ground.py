@@ -14,15 +14,15 @@ import numpy as np
 from scipy.ndimage import binary_opening, correlate1d, maximum_filter
 from scipy.special import ndtr, ndtri
 
-from vinemap.bins import quantiles_in
-from vinemap.compiled import in_threads
+from vinemap.cloud.bins import quantiles_in
+from vinemap.compute.threads import in_threads
 from vinemap.errors import InputError
-from vinemap.raster import Grid, Raster, above, block_sum, cell_of, coarser, grid_over, sample, window
+from vinemap.geo.raster import Grid, Raster, above, block_sum, cell_of, coarser, grid_over, sample, window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.tiles import Cloud
+    from vinemap.cloud.tiles import Cloud
 
     Values = NDArray[np.float64]
 

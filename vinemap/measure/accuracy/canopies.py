@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from vinemap.section_table import modelling_indices, summarise_rows
-from vinemap.synthetic import foliage_outlines
+from vinemap.canopy.numbers import modelling_indices, summarise_rows
+from vinemap.simulate.survey import foliage_outlines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.parcel import CanopyModel, RowMap
-    from vinemap.synthetic import Foliage, Survey
+    from vinemap.simulate.survey import Foliage, Survey
 
     Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def compare_canopies(
     model, on_soil : CanopyModel
         Their canopies, and those of the thesis's feet.
     pairs : DataFrame
-        Matched rows of :func:`vinemap.evaluate.evaluate_rows`.
+        Matched rows of :func:`vinemap.evaluate.rows.evaluate_rows`.
     step : float
         Metres between sections.
     """

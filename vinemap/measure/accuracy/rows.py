@@ -1,7 +1,8 @@
-"""How accurate rows and canopies are, on simulated vineyards of every kind: ``python -m vinemap.accuracy [FAMILY …]``.
+"""How accurate rows and canopies are, on simulated vineyards of every kind: ``python -m vinemap.measure.accuracy``.
 
-Every family of ``vinemap.scenes`` is simulated with a few seeds and mapped in memory, without a boundary and with the
-settings as they come. What misses its bar is marked with "!". Of the worst row of each family a picture is drawn.
+Every family of :mod:`vinemap.simulate.scenes` is simulated with a few seeds and mapped in memory, without a boundary
+and with the settings as they come. What misses its bar is marked with "!". Of the worst row of each family a picture is
+drawn.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.canopy_accuracy import CanopyErrors, compare_canopies, pool_canopies
-from vinemap.cloud import PointCloud
-from vinemap.evaluate import evaluate_rows
+from vinemap.cloud.points import PointCloud
+from vinemap.config.settings import PolygonOptions, Settings
+from vinemap.evaluate.rows import evaluate_rows
+from vinemap.geo.raster import Raster, RowField, cell_of, sample, sample_across
+from vinemap.measure.accuracy.canopies import CanopyErrors, compare_canopies, pool_canopies
+from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.parcel import RowMap, map_rows, model_canopies
-from vinemap.raster import Raster, RowField, cell_of, sample, sample_across
-from vinemap.scenes import FAMILIES, family
-from vinemap.settings import PolygonOptions, Settings
-from vinemap.tables import as_markdown, as_text, fill
+from vinemap.simulate.scenes import FAMILIES, family
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import ArrayLike, NDArray
 
-    from vinemap.synthetic import Survey
+    from vinemap.simulate.survey import Survey
 
     Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class Errors(NamedTuple):
     """True rows."""
     found: int
     pairs: pd.DataFrame
-    """The pairs of :func:`vinemap.evaluate.evaluate_rows`."""
+    """The pairs of :func:`vinemap.evaluate.rows.evaluate_rows`."""
     terrain: Array
     """|error| of the DTM (m) at random points of the parcels."""
     direction: Array

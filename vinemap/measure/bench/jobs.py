@@ -1,4 +1,4 @@
-"""What the benchmark runs, each in a process of its own: ``python -m vinemap.bench_jobs JOB RESULT.json ARGUMENTS``.
+"""What the benchmark runs, each in a process of its own: ``python -m vinemap.measure.bench.jobs JOB RESULT ARGUMENTS``.
 
 Apart from surveys and reading: what a user would pick instead of a step of the chain, timed as it is used. What an
 alternative needs from the steps before it, the chain gives it, so that each is measured by its own step only.
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import shapely
     from numpy.typing import NDArray
 
+    from vinemap.geo.raster import Raster
     from vinemap.parcel import RowMap
-    from vinemap.raster import Raster
-    from vinemap.synthetic import Terrain, Vineyard
+    from vinemap.simulate.survey import Terrain, Vineyard
 
     Array = NDArray[np.float64]
 
@@ -64,8 +64,8 @@ def plot(millions: float) -> Plot:
     Rows are 2.7 m apart on a bend of 800 m radius and a slope of 15%, with bare ground about them: 16 rows of 112 m on
     a hectare where 4.7 million points lie, as in parcel F.
     """
-    from vinemap.scenes import hillside, rows_of
-    from vinemap.synthetic import Vineyard
+    from vinemap.simulate.scenes import hillside, rows_of
+    from vinemap.simulate.survey import Vineyard
 
     n = max(round(7.4 * math.sqrt(millions)), 3)
     margin = margin_of(millions)
@@ -93,7 +93,8 @@ def survey(millions: float, folder: str) -> dict[str, Any]:
     """Simulate a survey of that size unless it is there; its name holds a hash of how it is made."""
     import geopandas as gpd
 
-    from vinemap import scenes, synthetic
+    from vinemap.simulate import scenes
+    from vinemap.simulate import survey as synthetic
 
     source = "".join(
         inspect.getsource(part) for part in (plot, outline, margin_of, scenes.rows_of, scenes.hillside, synthetic)
@@ -118,8 +119,8 @@ def estate(millions: float, parcels: int, folder: str) -> dict[str, Any]:
     import pandas as pd
     from shapely import affinity
 
-    from vinemap import synthetic
-    from vinemap.crs import parse_crs
+    from vinemap.geo.crs import parse_crs
+    from vinemap.simulate import survey as synthetic
 
     source = "".join(inspect.getsource(part) for part in (plot, outline, margin_of, estate, synthetic))
     name = f"{millions:g}M-{parcels}-{zlib.crc32(f'{source}{DENSITY}{DENSITY_OUTSIDE}{SPACING}{MARGIN}'.encode()):08x}"
@@ -206,8 +207,8 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
     import CSF
     import shapely
 
-    from vinemap.raster import sample
-    from vinemap.vector import read_boundary
+    from vinemap.geo.raster import sample
+    from vinemap.product.geopackage import read_boundary
 
     xyz, found = mapped(cloud, boundary)
 
@@ -247,7 +248,7 @@ def rasterised(soil: Array, like: Raster) -> Raster:
     """Means of ground points (n, 3) in the cells of a raster, the empty ones filled from around."""
     from rasterio.fill import fillnodata
 
-    from vinemap.raster import Raster, cell_of
+    from vinemap.geo.raster import Raster, cell_of
 
     grid = like.grid
     cells = cell_of(soil[:, :2], grid)
@@ -263,8 +264,8 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     import geopandas as gpd
     from sklearn.cluster import DBSCAN
 
-    from vinemap.evaluate import evaluate_rows, read_lines
-    from vinemap.raster import sample
+    from vinemap.evaluate.rows import evaluate_rows, read_lines
+    from vinemap.geo.raster import sample
 
     xyz, found = mapped(cloud, boundary)
     heights = xyz[:, 2] - sample(found.dtm, xyz[:, :2])
@@ -322,9 +323,9 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
     """OpenCV's approxPolyN beside our c-gons, around the same hulls: the foliage's outlines in sections."""
     import cv2
 
-    from vinemap.cgon import enclose, hull
+    from vinemap.canopy.cgon import enclose, hull
+    from vinemap.config.settings import PolygonOptions, Settings
     from vinemap.parcel import model_canopies
-    from vinemap.settings import PolygonOptions, Settings
 
     _, found = mapped(cloud, boundary)
     outlines = model_canopies(found, Settings(polygon=PolygonOptions(c=OUTLINE))).polygons
@@ -350,10 +351,10 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
 
 def mapped(cloud: str, boundary: str) -> tuple[Array, RowMap]:
     """Points (n, 3) of a parcel, and its rows as they come."""
-    from vinemap.las import read_cloud
+    from vinemap.cloud.las import read_cloud
+    from vinemap.config.settings import Settings
     from vinemap.parcel import map_rows
-    from vinemap.settings import Settings
-    from vinemap.vector import read_boundary
+    from vinemap.product.geopackage import read_boundary
 
     points = read_cloud(Path(cloud), boundary=read_boundary(Path(boundary)))
     return np.concatenate([part.xyz for part in points.parts()]), map_rows(points, Settings())

@@ -1,4 +1,4 @@
-"""How fast the chain is and how much memory it takes, on parcels of several sizes: ``python -m vinemap.bench``.
+"""How fast the chain is and how much memory it takes, on parcels of several sizes: ``python -m vinemap.measure.bench``.
 
 A run of ``vinemap run`` as a user starts it is held against plain reading of the same file, against what is promised,
 and against what a user would pick instead of a step. Everything that is measured has a process of its own.
@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from vinemap import __version__, paths
-from vinemap.cli import FILE, plain_errors
+from vinemap.cli.main import FILE, plain_errors
+from vinemap.compute.processes import must, run_process, summed_memory
 from vinemap.errors import ConfigError
-from vinemap.processes import must, run_process, summed_memory
-from vinemap.tables import as_markdown, as_text, fill
+from vinemap.measure.tables import as_markdown, as_text, fill
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -65,7 +65,7 @@ class Alternative(NamedTuple):
 
     step: str
     job: str
-    """Of ``vinemap.bench_jobs``."""
+    """Of ``vinemap.measure.bench.jobs``."""
     module: str
     """That it needs."""
     stages: tuple[str, str] | None
@@ -114,9 +114,9 @@ class Bar(NamedTuple):
 
 
 def job(name: str, result: Path, **arguments: Any) -> list[str]:
-    """Command of a job of ``vinemap.bench_jobs``."""
+    """Command of a job of ``vinemap.measure.bench.jobs``."""
     result.parent.mkdir(parents=True, exist_ok=True)
-    return [sys.executable, "-m", "vinemap.bench_jobs", name, str(result), json.dumps(arguments)]
+    return [sys.executable, "-m", "vinemap.measure.bench.jobs", name, str(result), json.dumps(arguments)]
 
 
 def load(path: Path) -> Any:
@@ -126,7 +126,7 @@ def load(path: Path) -> Any:
 
 def vinemap_run(cloud: Path | str, *options: str) -> list[str]:
     """Command that maps a cloud."""
-    return [sys.executable, "-m", "vinemap.cli", "run", str(cloud), *options]
+    return [sys.executable, "-m", "vinemap", "run", str(cloud), *options]
 
 
 def ensure_survey(millions: float, out: Path) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def many(millions: float, parcels: int, out: Path) -> Lines:
     files = load(made)
     must(job("reading", read, cloud=files["cloud"]))
     products = out / "products" / f"estate-{millions:g}M"
-    command = [sys.executable, "-m", "vinemap.cli", "survey", files["cloud"], "--again"]
+    command = [sys.executable, "-m", "vinemap", "survey", files["cloud"], "--again"]
     with summed_memory() as most:
         whole = must([*command, "--boundaries", files["boundaries"], "--out", str(products)])
     found = load(read)

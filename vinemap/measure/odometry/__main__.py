@@ -1,4 +1,4 @@
-"""How well odometry measures on simulated frames, whose movement is known: ``python -m vinemap.odometry_accuracy``.
+"""How well odometry measures on simulated frames, whose movement is known: ``python -m vinemap.measure.odometry``.
 
 Tables 4.3 and 4.4 of the thesis, relief, its Fig. 4.9 to 4.11, what happens when lost, and the error gathered along its
 paths. What misses its bar is marked with "!".
@@ -13,10 +13,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from vinemap import odometry_plots as plots
-from vinemap.cli import FILE, plain_errors
-from vinemap.odometry_tables import MOST_SECONDS, drift_table, loss_table, relief_table, size_table, terrain_tables
-from vinemap.odometry_trials import (
+from vinemap.cli.main import FILE, plain_errors
+from vinemap.measure.odometry import plots
+from vinemap.measure.odometry.tables import (
+    MOST_SECONDS,
+    drift_table,
+    loss_table,
+    relief_table,
+    size_table,
+    terrain_tables,
+)
+from vinemap.measure.odometry.trials import (
     SHARES,
     drifts,
     frames_to_time,
@@ -27,15 +34,15 @@ from vinemap.odometry_trials import (
     seconds_of,
     size_of,
 )
-from vinemap.tables import as_markdown, as_text, fill
-from vinemap.virtual_camera import LOW, MADE, PHOTOGRAPHS, lay_ground
-from vinemap.virtual_steps import PATCH, walk
+from vinemap.measure.tables import as_markdown, as_text, fill
+from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground
+from vinemap.simulate.steps import PATCH, walk
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vinemap.odometry_plots import Panel
-    from vinemap.odometry_tables import Lines
+    from vinemap.measure.odometry.plots import Panel
+    from vinemap.measure.odometry.tables import Lines
 
     Panels = list[list[Panel]]
 

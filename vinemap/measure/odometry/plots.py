@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.odometry_tables import NAMES
-from vinemap.odometry_trials import CAMERAS
+from vinemap.measure.odometry.tables import NAMES
+from vinemap.measure.odometry.trials import CAMERAS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from vinemap.odometry_trials import Array, ByMethod, Drift, Errors, Size
+    from vinemap.measure.odometry.trials import Array, ByMethod, Drift, Errors, Size
 
     Panel = Callable[[Axes], None]
 

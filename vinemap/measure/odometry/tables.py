@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.odometry_trials import CAMERAS, METHODS, RELIEFS
+from vinemap.measure.odometry.trials import CAMERAS, METHODS, RELIEFS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from vinemap.odometry import Method
-    from vinemap.odometry_trials import ByMethod, Drift, Losses, Size
+    from vinemap.measure.odometry.trials import ByMethod, Drift, Losses, Size
+    from vinemap.odometry.step import Method
 
     Lines = list[list[str]]
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.frames import Frame
-from vinemap.odometry import estimate_motion
-from vinemap.poses import STILL, Pose, moved, onward
-from vinemap.track import follow
-from vinemap.virtual_camera import HIGH, LOW, lay_ground, render, sinusoid, wander
-from vinemap.virtual_steps import ROOM, beyond, unrelated, walk
+from vinemap.odometry.frames import Frame
+from vinemap.odometry.poses import STILL, Pose, moved, onward
+from vinemap.odometry.step import estimate_motion
+from vinemap.odometry.track import follow
+from vinemap.simulate.camera import HIGH, LOW, lay_ground, render, sinusoid, wander
+from vinemap.simulate.steps import ROOM, beyond, unrelated, walk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.camera import Camera
-    from vinemap.odometry import Method, Strategy
-    from vinemap.virtual_camera import Image
-    from vinemap.virtual_steps import Step
+    from vinemap.config.camera import Camera
+    from vinemap.odometry.step import Method, Strategy
+    from vinemap.simulate.camera import Image
+    from vinemap.simulate.steps import Step
 
     Array = NDArray[np.floating]
     Follower = Callable[[Sequence[Image]], Pose]
@@ -211,7 +211,7 @@ def step_by_step(frames: Sequence[Image], *, method: Method) -> Pose:
 
 
 def by_keyframes(frames: Sequence[Image]) -> Pose:
-    """The same by :func:`vinemap.track.follow`."""
+    """The same by :func:`vinemap.odometry.track.follow`."""
     named = (Frame(str(k), None, image) for k, image in enumerate(frames))
     (last,) = deque(follow(named, camera=LOW), maxlen=1)
     return last.pose

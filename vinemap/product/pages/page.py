@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from vinemap import paths
-from vinemap.json_values import jsonable
+from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

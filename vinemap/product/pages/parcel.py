@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from affine import Affine
 
-from vinemap.page import as_json, page, polylines, rings, whole_numbers
-from vinemap.raster import block_sum
+from vinemap.geo.raster import block_sum
+from vinemap.product.pages.page import as_json, page, polylines, rings, whole_numbers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    from vinemap.raster import Raster
+    from vinemap.geo.raster import Raster
 
 TALLEST = 3.0
 """Height above ground, in metres, from which on the canopy's picture is darkest."""

@@ -14,11 +14,11 @@ import shapely
 from pyproj import CRS
 
 from vinemap import __version__, paths
-from vinemap.changes import GONE, MEASURES, compare_rows, summarise
-from vinemap.compiled import in_threads
-from vinemap.crs import WGS84, project
-from vinemap.page import as_json, page, page_hash, polylines, rings
-from vinemap.store import write_whole
+from vinemap.compute.threads import in_threads
+from vinemap.evaluate.changes import GONE, MEASURES, compare_rows, summarise
+from vinemap.geo.crs import WGS84, project
+from vinemap.product.pages.page import as_json, page, page_hash, polylines, rings
+from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinemap.symbology import node, options, rgba, single_symbol
+from vinemap.product.qgis.symbology import node, options, rgba, single_symbol
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -42,7 +42,7 @@ def print_layout(
     bounds: Sequence[float],
     legend: Sequence[tuple[str, str, str]],
 ) -> Element:
-    """A layout for :func:`vinemap.project.project`.
+    """A layout for :func:`vinemap.product.qgis.project.project`.
 
     Parameters
     ----------

@@ -10,10 +10,10 @@ import zipfile
 from typing import TYPE_CHECKING, NamedTuple
 from xml.etree.ElementTree import Element, tostring
 
-from vinemap.crs import WGS84
-from vinemap.print_layout import print_layout
-from vinemap.style import Style, raster_style, relief_style, vector_style
-from vinemap.symbology import QGIS, node
+from vinemap.geo.crs import WGS84
+from vinemap.product.qgis.print_layout import print_layout
+from vinemap.product.qgis.style import Style, raster_style, relief_style, vector_style
+from vinemap.product.qgis.symbology import QGIS, node
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from pyproj import CRS
 
-    from vinemap.raster import Raster
+    from vinemap.geo.raster import Raster
 
 MARGIN = 0.06
 """Share of the parcel's size that the map shows about it."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from vinemap.symbology import (
+from vinemap.product.qgis.symbology import (
     classes_of,
     graduated,
     hillshade,

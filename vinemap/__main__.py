@@ -1,0 +1,5 @@
+"""The command line as ``python -m vinemap``."""
+
+from vinemap.cli.main import main
+
+main()

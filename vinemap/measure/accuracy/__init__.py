@@ -1,0 +1,1 @@
+"""``make accuracy``: rows and canopies of simulated vineyards against their truth."""

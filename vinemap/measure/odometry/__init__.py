@@ -1,0 +1,1 @@
+"""``make odometry``: errors, drift and lost steps of odometry on simulated frames."""
