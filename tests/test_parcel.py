@@ -16,7 +16,7 @@ from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.geo.crs import Origin, main_to_wgs84
 from vinemap.parcel import STAGES, call, map_parcel
-from vinemap.product.geopackage import LAYERS
+from vinemap.product.layers import LAYERS
 from vinemap.simulate.scenes import hillside, rows_of
 from vinemap.simulate.survey import Obstacle, Vineyard, simulate, write_survey
 

@@ -13,16 +13,15 @@ from pyproj import CRS
 from scipy.spatial import cKDTree
 
 from vinemap import paths
-from vinemap.canopy.foliage import section_meshes
-from vinemap.canopy.mesh import volume
+from vinemap.canopy.mesh import section_meshes, volume
 from vinemap.canopy.numbers import modelling_indices, summarise_rows
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.evaluate.rows import evaluate_rows
+from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.crs import Origin
 from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
-from vinemap.product.geopackage import read_boundary
 from vinemap.surfaces.ground import terrain_model
 
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)

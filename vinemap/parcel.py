@@ -14,27 +14,33 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from vinemap import __version__, paths
-from vinemap.canopy.cgon import enclose, grow, peel_sections
+from vinemap.canopy.cgon import enclose
 from vinemap.canopy.classification import classify_points
-from vinemap.canopy.foliage import NO_CANOPY, find_feet, foliage_reach, living_canopies, section_meshes, separate_canopy
+from vinemap.canopy.feet import find_feet
+from vinemap.canopy.foliage import NO_CANOPY, living_canopies, separate_canopy
+from vinemap.canopy.growth import foliage_reach, grow
+from vinemap.canopy.mesh import section_meshes
 from vinemap.canopy.numbers import Measures, measure_sections, summarise_rows, tabulate_sections
+from vinemap.canopy.peeling import peel_sections
+from vinemap.canopy.points import join
 from vinemap.canopy.sections import cut_sections
-from vinemap.cloud.las import read_cloud, write_classified
+from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, pdal_versions, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
-from vinemap.cloud.points import join
 from vinemap.cloud.tiles import Collector
+from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.compute.threads import in_threads
-from vinemap.config.surveys import check_name
+from vinemap.config.names import check_name
 from vinemap.errors import InputError, own_fault
 from vinemap.geo.crs import Origin, to_main, to_wgs84
 from vinemap.product import store
+from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.notices import notices
 from vinemap.product.pages.parcel import parcel_page
 from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.product.stac import parcel_item, save
-from vinemap.product.write import labelled, parcel_layer, write_product
+from vinemap.product.write import write_product
 from vinemap.rows.blocks import group_blocks
 from vinemap.rows.clusters import cluster_rows
 from vinemap.rows.confidence import judge_rows
@@ -44,8 +50,10 @@ from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
 from vinemap.rows.missing import count_missing
 from vinemap.rows.numbers import describe_rows, number_rows
+from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.cover import canopy_cover
-from vinemap.surfaces.ground import block_side, canopy_height_model, terrain_model
+from vinemap.surfaces.ground import terrain_model
+from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -56,8 +64,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.canopy.foliage import Canopy
+    from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
-    from vinemap.cloud.points import Sections
     from vinemap.cloud.tiles import Cloud
     from vinemap.config.settings import Settings
     from vinemap.geo.raster import Raster, RowField

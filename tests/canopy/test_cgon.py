@@ -9,7 +9,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 from shapely import MultiPoint, Point, Polygon
 
-from vinemap.canopy.cgon import enclose, grow, hull, peel, peel_sections
+from vinemap.canopy.cgon import enclose
+from vinemap.canopy.growth import grow
+from vinemap.canopy.hull import hull
+from vinemap.canopy.peeling import peel, peel_sections
 
 
 def cross(a, b, p):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from vinemap.canopy.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
-from vinemap.cloud.las import write_classified
 from vinemap.cloud.points import PointCloud
+from vinemap.cloud.write import write_classified
 from vinemap.config.settings import Settings
 from vinemap.parcel import find_canopies, map_rows
 

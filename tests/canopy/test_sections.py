@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
-from vinemap.canopy.cgon import peel_sections
-from vinemap.canopy.foliage import find_feet, foliage_reach, living_canopies, separate_canopy
+from vinemap.canopy.feet import find_feet
+from vinemap.canopy.foliage import living_canopies, separate_canopy
+from vinemap.canopy.growth import foliage_reach
 from vinemap.canopy.numbers import (
     complexity_reduction,
     measure_sections,
@@ -20,8 +21,10 @@ from vinemap.canopy.numbers import (
     summarise_rows,
     tabulate_sections,
 )
+from vinemap.canopy.peeling import peel_sections
+from vinemap.canopy.points import NO_SECTIONS, Sections, join
 from vinemap.canopy.sections import cut_sections
-from vinemap.cloud.points import NO_SECTIONS, PointCloud, Sections, join
+from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.geo.raster import Grid, Raster
 from vinemap.parcel import model_sections

@@ -24,9 +24,9 @@ from vinemap.cloud.pdal import ground_pipeline, read_cloud_pdal, reading_pipelin
 from vinemap.config.settings import GroundOptions, Settings
 from vinemap.errors import DependencyError, InputError
 from vinemap.evaluate.rows import evaluate_rows
+from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.raster import sample
 from vinemap.parcel import map_parcel
-from vinemap.product.geopackage import read_boundary
 from vinemap.simulate.survey import write_survey
 from vinemap.surfaces.ground import terrain_model
 

@@ -23,7 +23,9 @@ from vinemap.errors import InputError, OutputError
 from vinemap.geo.raster import grid_over, squares, window
 from vinemap.parcel import call, map_parcel, map_rows, model_canopies
 from vinemap.simulate.survey import write_survey
-from vinemap.surfaces.ground import block_side, canopy_height_model, terrain_model
+from vinemap.surfaces.canopy_height import canopy_height_model
+from vinemap.surfaces.ground import terrain_model
+from vinemap.surfaces.statistics import block_side
 
 UTM = CRS.from_epsg(32632)
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)

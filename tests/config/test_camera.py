@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vinemap.config.camera import Camera
-from vinemap.config.surveys import load_camera
+from vinemap.config.drives import load_camera
 from vinemap.config.template import template
 from vinemap.errors import ConfigError
 from vinemap.simulate.camera import LOW

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from vinemap.config.names import check_name
 from vinemap.config.settings import Settings
-from vinemap.config.surveys import check_name, choose_parcel, load_estate, load_settings, load_survey
+from vinemap.config.surveys import choose_parcel, load_estate, load_settings, load_survey
 from vinemap.errors import ConfigError
 
 SURVEY = "survey: barolo\nparcels: [F, curved, blocks]\n"

@@ -13,12 +13,12 @@ from meshes import ORIGIN, bumpy, rows
 from pyproj import Transformer
 
 from vinemap import paths
-from vinemap.canopy.mesh import volume, write_glb
+from vinemap.canopy.mesh import volume
 from vinemap.errors import InputError
 from vinemap.export.write import export_products
 from vinemap.geo.crs import Origin, main_to_wgs84, to_main
 from vinemap.parcel import map_parcel
-from vinemap.product.gltf import read_glb
+from vinemap.product.gltf import read_glb, write_glb
 from vinemap.simulate.scenes import hillside, rows_of
 from vinemap.simulate.survey import Vineyard, simulate, write_survey
 

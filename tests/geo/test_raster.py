@@ -20,8 +20,8 @@ from vinemap.geo.raster import (
     sample,
     squares,
     window,
-    write_cog,
 )
+from vinemap.product.rasters import write_cog
 
 UTM = CRS.from_epsg(32632)
 

@@ -27,12 +27,12 @@ from vinemap.cloud.tiles import Collector
 from vinemap.compute.processes import descendants
 from vinemap.config.surveys import survey_config
 from vinemap.errors import BusyError, InputError, OutputError, VinemapError, WorkerError
+from vinemap.geo.boundaries import read_parcels
 from vinemap.geo.crs import parse_crs
 from vinemap.jobs import survey
 from vinemap.jobs.plan import CURRENT, DONE, FAILED, OUTSIDE, plan_survey
 from vinemap.jobs.survey import map_survey
 from vinemap.product import recipe, store
-from vinemap.product.geopackage import read_parcels
 
 PLACE = np.array([414_700.0, 4_940_700.0])
 SIDE = 10.0

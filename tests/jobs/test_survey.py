@@ -22,10 +22,10 @@ from vinemap.cloud.pieces import read_piece, split_cloud
 from vinemap.cloud.tiles import Collector
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError, OutputError, WorkerError
+from vinemap.geo.boundaries import read_boundary
 from vinemap.jobs.plan import CURRENT, DONE, FAILED
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import map_parcel
-from vinemap.product.geopackage import read_boundary
 from vinemap.product.recipe import product_in
 
 KILLS = int(os.environ.get("VINEMAP_KILLS", "2"))

@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.canopy.numbers import measure_sections, tabulate_sections
-from vinemap.cloud.points import Sections
+from vinemap.canopy.points import Sections
 from vinemap.measure.accuracy.canopies import compare_canopies, pool_canopies
 from vinemap.parcel import CanopyModel, RowMap
 from vinemap.simulate.scenes import hillside, rows_of

@@ -20,7 +20,7 @@ from vinemap.errors import InputError, OutputError
 from vinemap.geo.crs import Start
 from vinemap.odometry.drive import map_drive
 from vinemap.odometry.poses import moved
-from vinemap.product.geopackage import TRACK_LAYERS
+from vinemap.product.layers import TRACK_LAYERS
 from vinemap.simulate.camera import LOW
 
 N = 12

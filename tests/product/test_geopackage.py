@@ -10,7 +10,9 @@ import pytest
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.product.geopackage import LAYERS, conform, read_boundary, read_parcels, write_geopackage
+from vinemap.geo.boundaries import read_boundary, read_parcels
+from vinemap.product.geopackage import write_geopackage
+from vinemap.product.layers import LAYERS, conform
 
 CONTRACT = {
     "rows": (

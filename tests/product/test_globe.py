@@ -14,13 +14,14 @@ import trimesh
 from pyproj import CRS, Transformer
 
 from vinemap import paths
-from vinemap.canopy.mesh import Mesh, loft, write_glb
+from vinemap.canopy.mesh import Mesh, loft
 from vinemap.config.settings import Settings
 from vinemap.config.surveys import survey_config
 from vinemap.geo.crs import to_wgs84
 from vinemap.geo.geoid import find_geoid
 from vinemap.jobs.survey import _write_tileset, map_survey
 from vinemap.product.globe import parcel_tileset, survey_tileset
+from vinemap.product.gltf import write_glb
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
 """What a reader of 3D Tiles does to glTF."""

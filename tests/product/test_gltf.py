@@ -10,7 +10,8 @@ import trimesh
 from meshes import FLAT, LEANING, NOTCHED, ORIGIN, SQUARE, along, area, bumpy, closed, rows
 
 import vinemap
-from vinemap.canopy.mesh import Mesh, loft, merge, volume, write_glb
+from vinemap.canopy.mesh import Mesh, loft, merge, volume
+from vinemap.product.gltf import write_glb
 
 TURN = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 """Z up to Y up."""

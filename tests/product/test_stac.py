@@ -20,8 +20,9 @@ from pystac.validation import JsonSchemaSTACValidator
 
 from vinemap import paths
 from vinemap.geo.crs import WGS84, project
-from vinemap.geo.raster import Grid, Raster, write_cog
+from vinemap.geo.raster import Grid, Raster
 from vinemap.parcel import map_parcel
+from vinemap.product.rasters import write_cog
 from vinemap.product.recipe import read_source
 from vinemap.product.stac import parcel_item, save, write_collection
 from vinemap.simulate.survey import write_survey

@@ -15,7 +15,8 @@ import pytest
 from systems import LINUX, POSIX
 
 from vinemap import paths
-from vinemap.config.surveys import LONGEST_NAME, MOST_BYTES, check_name
+from vinemap.config.names import check_name
+from vinemap.config.surveys import LONGEST_NAME, MOST_BYTES
 from vinemap.errors import BusyError, OutputError
 from vinemap.product import store
 

@@ -103,7 +103,7 @@ def test_the_edge_of_the_ground_is_no_ground():
 
 
 def test_a_recording_to_try_things_on(tmp_path):
-    from vinemap.config.surveys import load_camera
+    from vinemap.config.drives import load_camera
     from vinemap.odometry.frames import read_recording
     from vinemap.simulate.drive import BEGUN, record
 

@@ -9,7 +9,8 @@ from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import sample
 from vinemap.simulate.scenes import hillside, rows_of, terraced
 from vinemap.simulate.survey import Obstacle, Vineyard, simulate
-from vinemap.surfaces.ground import canopy_height_model, terrain_model
+from vinemap.surfaces.canopy_height import canopy_height_model
+from vinemap.surfaces.ground import terrain_model
 
 UTM = parse_crs("EPSG:32632")
 

@@ -11,7 +11,20 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.canopy.hull import (
+    FLAT,
+    area_of,
+    as_complex,
+    as_pairs,
+    checked_start,
+    cross,
+    order_of,
+    ring_of,
+    shared_area,
+)
+from vinemap.canopy.peeling import peel_section
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -21,29 +34,10 @@ if TYPE_CHECKING:
     Ints = NDArray[np.int64]
     Flags = NDArray[np.bool_]
 
-FLAT = 1e-12
-"""Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""
-BLUNT = 0.5
-"""Cosine of the turn up to which a corner of a grown outline stays one; sharper ones are cut."""
 LONGEST = 256
 """An outline of more edges is first simplified from outside: no two edges in a row turn by less than 360°/LONGEST."""
-
-
-class Peeled(NamedTuple):
-    """What is left of m sections of n points once their outliers are peeled off."""
-
-    kept: Flags
-    """(n,) False for outliers and non-finite points."""
-    area: Floats
-    """(m,) area of the kept points' convex hull, m²; NaN for fewer than 3 finite points."""
-    perimeter: Floats
-    """(m,) length of that hull's outline, m."""
-    hull: Floats
-    """(h, 2) the hulls' vertices, section after section, counter-clockwise, m."""
-    start: Ints
-    """(m + 1,) where each section's begin; none for fewer than 3 finite points."""
 
 
 class Enclosures(NamedTuple):
@@ -61,70 +55,6 @@ class Enclosures(NamedTuple):
     """(m,) area of the c-gon, m²."""
     shared_area: Floats
     """(m,) area that the c-gon and that hull share, m²."""
-
-
-def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -> Peeled:
-    """Peel a share of every section's points, rounded up, off as outliers; at least 3 points stay (Algorithm 1).
-
-    Parameters
-    ----------
-    points : array_like of shape (n, 2)
-        (y, z) of all sections, section after section, m.
-    start : array_like of shape (m + 1,)
-        Section k holds ``points[start[k]:start[k + 1]]``.
-    share : float
-        Share of a section's points.
-
-    Raises
-    ------
-    ValueError
-        If share or start is out of bounds.
-    """
-    section = as_complex(points)
-    offsets = _checked(start, len(section), share)
-    m = len(offsets) - 1
-    kept, area, perimeter = np.isfinite(section), np.full(m, math.nan), np.full(m, math.nan)
-    hulls, size = np.empty(len(section), dtype=np.complex128), np.zeros(m, dtype=np.int64)
-    in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, hulls, size), stretches(m))
-    return Peeled(kept, area, perimeter, *_packed(hulls, offsets[:-1], size))
-
-
-def _packed(points: Points, at: Ints, size: Ints) -> tuple[Floats, Ints]:
-    """Points (k, 2) that were written with room between them, ``size`` of them from each place on, and their starts."""
-    start = np.concatenate([[0], np.cumsum(size)])
-    return as_pairs(points[np.arange(start[-1]) + np.repeat(at - start[:-1], size)]), start
-
-
-def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike) -> tuple[Floats, Ints, Floats]:
-    """Outline of every section's foliage: the convex hull of its points and its feet, and what lies within reach of it.
-
-    Parameters
-    ----------
-    points, start : array_like of shape (n, 2), (m + 1,)
-        As in :func:`peel_sections`.
-    feet : array_like of shape (m, 3, 2)
-        v1 (bottom, middle), v2 (right foot, positive y) and vc (left foot), m.
-    reach : array_like of shape (m,)
-        Metres by which edges are moved outward.
-
-    Returns
-    -------
-    points : array (k, 2)
-        Vertices of the outlines, section after section; sharp corners are cut.
-    start : array (m + 1,)
-        Where each section's begin.
-    feet : array (m, 3, 2)
-        The feet, moved down by the reach and outward by half of it.
-    """
-    section = as_complex(points)
-    offsets = _checked(start, len(section), 0.0)
-    fixed, out = as_complex(feet).reshape(-1, 3), np.asarray(reach, dtype=float)
-    room = offsets + 2 * np.arange(len(offsets))
-    outline, size = np.empty(2 * room[-1], dtype=np.complex128), np.zeros(len(fixed), dtype=np.int64)
-    in_threads(lambda part: _grow_all(*part, section, offsets, fixed, out, outline, size), stretches(len(size)))
-    left = np.where(fixed[:, 1].real >= fixed[:, 2].real, 0.5, -0.5)
-    moved = fixed + out[:, None] * np.stack([0 * left - 1j, left - 1j, -left - 1j], axis=1)
-    return *_packed(outline, 2 * room[:-1], size), as_pairs(moved)
 
 
 def enclose(
@@ -165,7 +95,7 @@ def enclose(
     Algorithm 1 and Eq. 12-19 of the thesis; the bilinear programme's optimum is found exactly, by choosing edges.
     """
     section, fixed = as_complex(points), as_complex(feet).reshape(-1, 3)
-    offsets = _checked(start, len(section), share)
+    offsets = checked_start(start, len(section), share)
     if c < 5:
         raise ValueError(f"c is {c}: a c-gon with three fixed vertices needs c >= 5")
     if len(offsets) != len(fixed) + 1:
@@ -176,196 +106,6 @@ def enclose(
         lambda part: _enclose_all(*part, section, offsets, fixed, share, slide, polygon, kept, areas), stretches(m)
     )
     return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), kept, *areas)
-
-
-def _checked(start: ArrayLike, n: int, share: float) -> Ints:
-    offsets = np.ascontiguousarray(start, dtype=np.int64)
-    if not 0 <= share < 1:
-        raise ValueError(f"share is {share}: give a share of the points in [0, 1)")
-    if len(offsets) == 0 or offsets[0] != 0 or offsets[-1] != n or np.any(np.diff(offsets) < 0):
-        raise ValueError(f"start must climb from 0 to {n}")
-    return offsets
-
-
-def hull(points: ArrayLike) -> Ints:
-    """Indices (h,) of the vertices of the convex hull of points (n, 2), counter-clockwise from the leftmost (Eq. 12).
-
-    Of points that coincide the first is the vertex; points on the hull's edges are none.
-    """
-    section = as_complex(points)
-    order = _sorted(section)
-    return order[_hull(section[order])] if len(section) else order
-
-
-def peel(points: ArrayLike, count: int) -> Ints:
-    """Indices of up to ``count`` outliers among points (n, 2), in the order of their removal (Algorithm 1).
-
-    Each is the hull vertex without which the hull's area shrinks most (ties: the lowest index). Stops at 3 points, and
-    where the hull has no area left.
-    """
-    section = as_complex(points)
-    order = _sorted(section)
-    return order[_peel(section[order], order, count)[0]] if len(section) else order
-
-
-def as_complex(points: ArrayLike) -> Points:
-    """Points (..., 2) as complex numbers (...)."""
-    return np.ascontiguousarray(points, dtype=np.float64).reshape(*np.shape(points)[:-1], 2).view(np.complex128)[..., 0]
-
-
-def as_pairs(points: Points) -> Floats:
-    """Complex numbers (...) as points (..., 2)."""
-    return np.ascontiguousarray(points).view(np.float64).reshape(*points.shape, 2)
-
-
-@compiled
-def _cross(a: complex, b: complex, p: complex) -> float:
-    """Twice the area of (a, b, p): positive where p is left of a → b."""
-    return (b.real - a.real) * (p.imag - a.imag) - (b.imag - a.imag) * (p.real - a.real)
-
-
-@compiled
-def _area(polygon: Points) -> float:
-    """Shoelace area, positive if counter-clockwise (Eq. 13 without its absolute values)."""
-    total = 0.0
-    for i in range(2, len(polygon)):
-        total += _cross(polygon[0], polygon[i - 1], polygon[i])
-    return total / 2
-
-
-@compiled
-def _sorted(p: Points) -> Ints:
-    """Order by y, then z, then index (bottom-up merge sort)."""
-    n = len(p)
-    order, spare = np.arange(n), np.empty(n, dtype=np.int64)
-    width = 1
-    while width < n:
-        for low in range(0, n, 2 * width):
-            middle, high = min(low + width, n), min(low + 2 * width, n)
-            i, j = low, middle
-            for k in range(low, high):
-                take = i < middle
-                if take and j < high:
-                    a, b = p[order[i]], p[order[j]]
-                    take = a.real < b.real or (a.real == b.real and a.imag <= b.imag)
-                if take:
-                    spare[k] = order[i]
-                    i += 1
-                else:
-                    spare[k] = order[j]
-                    j += 1
-        order, spare = spare, order
-        width *= 2
-    return order
-
-
-@compiled
-def _append(p: Points, chain: Ints, floor: int, size: int, i: int) -> int:
-    """Add point i to the convex chain that begins at chain[floor], dropping those that it hides; the new size."""
-    while size - floor >= 2 and _cross(p[chain[size - 2]], p[chain[size - 1]], p[i]) <= 0:
-        size -= 1
-    chain[size] = i
-    return size + 1
-
-
-@compiled
-def _hull(p: Points) -> Ints:
-    """Positions on the hull of sorted points (monotone chain)."""
-    n = len(p)
-    chain = np.empty(n + 2, dtype=np.int64)
-    lower = np.zeros(n, dtype=np.bool_)  # on a line, rounding could have a point on both chains
-    floor, size = 0, 0
-    for k in range(2 * n - 1):  # to the right over the lower points, back over the upper ones
-        i = k if k < n else 2 * n - 2 - k
-        if k == n:
-            floor = size - 1
-            for j in range(1, size):
-                lower[chain[j]] = True
-        if i == 0 or (p[i] != p[i - 1] and not lower[i]):
-            size = _append(p, chain, floor, size, i)
-    return chain[: max(size - 1, 1)]
-
-
-@compiled
-def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
-    """Extend the chain from its last point to ``stop`` over the inner points right of the line between them."""
-    floor = size - 1
-    first = chain[floor]
-    a, b = p[first], p[stop]
-    step = 1 if stop > first else -1
-    for i in range(first + step, stop, step):
-        if inner[i] and _cross(a, b, p[i]) < 0 and not (i > 0 and inner[i - 1] and p[i] == p[i - 1]):
-            size = _append(p, chain, floor, size, i)
-    return _append(p, chain, floor, size, stop) if stop != first else size
-
-
-@compiled
-def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[int, float]:
-    """Hull from one neighbour of u to the other once u is gone: size of ``chain``, and twice the area lost."""
-    a, b = ring[0, u], ring[1, u]
-    chain[0] = a
-    if u + 1 < len(p) and inner[u + 1] and p[u + 1] == p[u]:
-        chain[1], chain[2] = u + 1, b
-        return 3, 0.0
-    size = 1
-    if (a < u) != (u < b):  # u is the leftmost or rightmost: the chain turns at the one that takes its place
-        step = 1 if u < a else -1
-        end = u + step
-        while end not in (a, b) and (not inner[end] or p[end] == p[a] or p[end] == p[b]):
-            end += step
-        while end > 0 and inner[end] and inner[end - 1] and p[end] == p[end - 1]:
-            end -= 1
-        size = _walk(p, inner, chain, size, end)
-    turned = size
-    for k in range(1, turned):  # on a line, rounding could have these found again on the way back
-        inner[chain[k]] = False
-    size = _walk(p, inner, chain, size, b)
-    for k in range(1, turned):
-        inner[chain[k]] = chain[k] != b
-    loss = _cross(p[a], p[u], p[b])
-    for k in range(2, size):
-        loss -= _cross(p[a], p[chain[k - 1]], p[chain[k]])
-    return size, loss
-
-
-@compiled
-def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
-    """Positions removed from sorted points, in order, and those on the hull that is left; ``index`` breaks ties."""
-    n = len(p)
-    vertices = _hull(p)
-    size = len(vertices)
-    removed = np.empty(max(min(count, n - 3), 0), dtype=np.int64)
-    if len(removed) == 0 or size < 3:
-        return removed[:0], vertices
-    ring, chain = np.empty((2, n), dtype=np.int64), np.empty(n + 1, dtype=np.int64)
-    loss, inner = np.empty(n), np.ones(n, dtype=np.bool_)
-    for k in range(size):
-        u, v = vertices[k - 1], vertices[k]
-        ring[1, u], ring[0, v], inner[v] = v, u, False
-    for u in vertices:
-        loss[u] = _expose(p, inner, ring, u, chain)[1]
-    head, done = vertices[0], 0
-    while done < len(removed) and size >= 3:
-        best, u = head, ring[1, head]
-        while u != head:
-            if loss[u] > loss[best] or (loss[u] == loss[best] and index[u] < index[best]):
-                best = u
-            u = ring[1, u]
-        removed[done] = best
-        done += 1
-        head, u = ring[0, best], ring[1, best]
-        length = _expose(p, inner, ring, best, chain)[0]
-        size += length - 3
-        for k in range(1, length):
-            ring[1, chain[k - 1]], ring[0, chain[k]], inner[chain[k]] = chain[k], chain[k - 1], False
-        for _ in range(length if size >= 3 else 0):
-            loss[u] = _expose(p, inner, ring, u, chain)[1]
-            u = ring[0, u]
-    left = np.empty(size, dtype=np.int64)
-    for k in range(size):
-        left[k] = head
-        head = ring[1, head]
-    return removed[:done], left
 
 
 @compiled
@@ -381,7 +121,7 @@ def _place(ring: Points, foot: complex, side: float, extent: float) -> tuple[int
         if foot == a:
             return (k, 0.0, foot) if side > 0 else ((k - 1) % m, 1.0, foot)
         t = (foot.imag - a.imag) / d.imag if d.imag != 0 else math.nan
-        if 0 < foot.real - a.real < d.real and abs(_cross(a, a + d, foot)) <= FLAT * extent * abs(d):
+        if 0 < foot.real - a.real < d.real and abs(cross(a, a + d, foot)) <= FLAT * extent * abs(d):
             at, share, reach = k, (foot.real - a.real) / d.real, math.inf  # on the underside: it stays
         elif side * d.imag > 0 and 0 <= t <= 1 and side * (a.real + t * d.real) > reach:
             at, share, reach = k, t, side * (a.real + t * d.real)
@@ -400,8 +140,8 @@ def _outline(rest: Points, right: complex, left: complex) -> Points:
     corners[0], corners[1] = right, left
     for k in range(len(rest)):
         corners[k + 2] = rest[k]
-    corners = corners[_sorted(corners)]
-    ring = corners[_hull(corners)]
+    corners = corners[order_of(corners)]
+    ring = corners[ring_of(corners)]
     m = len(ring)
     low, high = corners[0].imag, corners[0].imag
     for corner in corners:
@@ -416,7 +156,7 @@ def _outline(rest: Points, right: complex, left: complex) -> Points:
     for k in range(1, between + 1):
         p, q, ahead = out[size - 1], ring[(first + k) % m], ring[(first + k + 1) % m] if k < between else left
         backward = ((q - p) * (ahead - q).conjugate()).real < 0
-        if backward or _cross(p, ahead, q) < -FLAT * extent * abs(ahead - p):
+        if backward or cross(p, ahead, q) < -FLAT * extent * abs(ahead - p):
             out[size] = q
             size += 1
     out[size] = left
@@ -437,8 +177,8 @@ def _corner(q: Points, i: int, j: int) -> tuple[complex, float]:
     turn = _turn(q, i, j)
     if j == i + 1 or turn <= 0:
         return q[j], 0.0 if j == i + 1 else math.inf
-    corner = q[i + 1] + _cross(q[j], q[j + 1], q[i + 1]) / turn * (q[i + 1] - q[i])
-    return corner, _cross(q[i + 1], corner, q[j])
+    corner = q[i + 1] + cross(q[j], q[j + 1], q[i + 1]) / turn * (q[i + 1] - q[i])
+    return corner, cross(q[i + 1], corner, q[j])
 
 
 @compiled
@@ -456,8 +196,8 @@ def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
         w = 2 * q[k] - q[i] - q[j]
         p = q[i] + (w.real * b.imag - w.imag * b.real) / turn * a
         r = q[j] + (a.real * w.imag - a.imag * w.real) / turn * b
-        if _cross(p, r, q[k - 1]) >= 0 and _cross(p, r, q[k + 1]) >= 0 and _cross(q[i + 1], p, r) >= 0:
-            added = _cross(q[i + 1], p, r) + _cross(q[i + 1], r, q[j])
+        if cross(p, r, q[k - 1]) >= 0 and cross(p, r, q[k + 1]) >= 0 and cross(q[i + 1], p, r) >= 0:
+            added = cross(q[i + 1], p, r) + cross(q[i + 1], r, q[j])
             if added < least:
                 one, two, least = p, r, added
     return one, two, least
@@ -473,12 +213,12 @@ def _choose(q: Points, c: int) -> Points:
     n, edges = len(q) - 1, c - 2
     swept = np.zeros(n + 1)
     for k in range(2, n + 1):
-        swept[k] = swept[k - 1] + _cross(q[0], q[k - 1], q[k])
+        swept[k] = swept[k - 1] + cross(q[0], q[k - 1], q[k])
     cost, origin = np.full((2, edges, n), math.inf), np.zeros((2, edges, n), dtype=np.int64)
     cost[0, 0, 0] = 0
     for j in range(1, n):
         for i in range(j):
-            chain = swept[j] - swept[i + 1] - _cross(q[0], q[i + 1], q[j])
+            chain = swept[j] - swept[i + 1] - cross(q[0], q[i + 1], q[j])
             flush, skip = _corner(q, i, j)[1] - chain, _tangent(q, i, j)[2] - chain
             for used in range(1, edges):
                 for spent in range(2):
@@ -558,9 +298,9 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
     out[0], out[1], out[c - 1] = bottom, q[0], q[-1]
     for k in range(c - 3):
         out[k + 2] = free[k]
-    if _cross(q[-1], q[0], bottom) > 0:
+    if cross(q[-1], q[0], bottom) > 0:
         for k in range(1, len(q)):
-            if _cross(q[k - 1], q[k], bottom) < 0:
+            if cross(q[k - 1], q[k], bottom) < 0:
                 out[0] = (q[0] + q[-1]) / 2
 
 
@@ -572,7 +312,7 @@ def _slide(rest: Points, bottom: complex, out: Points) -> bool:
         extent = max(extent, abs(corner - bottom))
     for k in range(len(rest)):
         a, b = rest[k - 1], rest[k]
-        if a.real < bottom.real < b.real and abs(_cross(a, b, bottom)) <= FLAT * extent * abs(b - a):
+        if a.real < bottom.real < b.real and abs(cross(a, b, bottom)) <= FLAT * extent * abs(b - a):
             q = _outline(rest, bottom, bottom)
             if len(q) > LONGEST:
                 q = _simplify(q)
@@ -582,96 +322,6 @@ def _slide(rest: Points, bottom: complex, out: Points) -> bool:
             out[0], out[1:] = bottom, free
             return True
     return False
-
-
-@compiled
-def _shared(polygon: Points, convex: Points) -> float:
-    """Area that a polygon shares with a convex one, both counter-clockwise (Sutherland and Hodgman 1974)."""
-    inside = polygon.copy()
-    for k in range(len(convex)):
-        a, b = convex[k - 1], convex[k]
-        out = np.empty(2 * len(inside) + 2, dtype=np.complex128)
-        size = 0
-        for i in range(len(inside)):
-            p, q = inside[i - 1], inside[i]
-            left_p, left_q = _cross(a, b, p), _cross(a, b, q)
-            if (left_p < 0) != (left_q < 0):
-                out[size] = p + (q - p) * (left_p / (left_p - left_q))
-                size += 1
-            if left_q >= 0:
-                out[size] = q
-                size += 1
-        inside = out[:size]
-        if size < 3:
-            return 0.0
-    return _area(inside)
-
-
-@compiled
-def _peel_one(points: Points, kept: Flags, share: float) -> Points:
-    """The convex hull of a section's kept points, once the outliers among them are no longer kept."""
-    here = np.flatnonzero(kept)
-    p = points[here]
-    order = _sorted(p)
-    p = p[order]
-    removed, ring = _peel(p, order, math.ceil(share * len(p) - 1e-9))
-    for i in removed:
-        kept[here[order[i]]] = False
-    return p[ring]
-
-
-@compiled
-def _peel_all(
-    first: int,
-    last: int,
-    points: Points,
-    start: Ints,
-    share: float,
-    kept: Flags,
-    area: Floats,
-    perimeter: Floats,
-    hulls: Points,
-    size: Ints,
-) -> None:
-    for k in range(first, last):
-        mine = slice(start[k], start[k + 1])
-        if kept[mine].sum() >= 3:
-            ring = _peel_one(points[mine], kept[mine], share)
-            area[k], size[k], perimeter[k] = _area(ring), len(ring), 0.0
-            for i in range(len(ring)):
-                hulls[start[k] + i] = ring[i]
-                perimeter[k] += abs(ring[i] - ring[i - 1])
-
-
-@compiled
-def _grow_all(
-    first: int, last: int, points: Points, start: Ints, feet: Points, reach: Floats, out: Points, sizes: Ints
-) -> None:
-    """Write the outlines' vertices, twice as many as a section's points and feet at the most, and how many they are."""
-    for k in range(first, last):
-        n = start[k + 1] - start[k]
-        body = np.empty(n + 2, dtype=np.complex128)
-        body[:n], body[n], body[n + 1] = points[start[k] : start[k + 1]], feet[k, 1], feet[k, 2]
-        body = body[_sorted(body)]
-        ring = body[_hull(body)]
-        at = size = 2 * (start[k] + 2 * k)
-        for i in range(len(ring)):
-            one, two = _outward(ring[i - 1], ring[i]), _outward(ring[i], ring[(i + 1) % len(ring)])
-            turn = one.real * two.real + one.imag * two.imag
-            if turn >= BLUNT:
-                out[size] = ring[i] + reach[k] * (one + two) / (1 + turn)
-                size += 1
-            else:
-                out[size], out[size + 1] = ring[i] + reach[k] * one, ring[i] + reach[k] * two
-                size += 2
-        sizes[k] = size - at
-
-
-@compiled
-def _outward(a: complex, b: complex) -> complex:
-    """Unit normal to the right of a → b, 0 where they coincide."""
-    edge = b - a
-    return -1j * edge / abs(edge) if edge != 0 else 0j
 
 
 @compiled
@@ -691,7 +341,7 @@ def _enclose_all(
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
         if kept[mine].sum() >= 3 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
-            ring = _peel_one(points[mine], kept[mine], share)
+            ring = peel_section(points[mine], kept[mine], share)
             if not (slide and _slide(ring, feet[k, 0], polygon[k])):
                 _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], polygon[k])
-            areas[0, k], areas[1, k], areas[2, k] = _area(ring), _area(polygon[k]), _shared(polygon[k], ring)
+            areas[0, k], areas[1, k], areas[2, k] = area_of(ring), area_of(polygon[k]), shared_area(polygon[k], ring)

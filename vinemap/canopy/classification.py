@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.cloud.points import PointCloud, Sections
+    from vinemap.canopy.points import Sections
+    from vinemap.cloud.points import PointCloud
 
     Values = NDArray[np.floating]
 

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import math
-import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-import vinemap
 from vinemap.errors import DependencyError
-from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
+    import geopandas as gpd
     from numpy.typing import ArrayLike, NDArray
+
+    from vinemap.canopy.points import Sections
 
     Vertices = NDArray[np.float64]
     Faces = NDArray[np.int64]
     Lofted = tuple[Vertices, Faces, tuple["Piece", ...]]
 
-Z_UP_TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
-"""Quaternion (x, y, z, w) that takes x east, y north, z up to glTF's x east, y up, z south."""
-GREEN = [0.13, 0.33, 0.07, 1.0]
-"""Linear RGBA of foliage."""
+    Values = NDArray[np.floating]
+    Flags = NDArray[np.bool_]
 
 
 class Piece(NamedTuple):
@@ -161,158 +158,6 @@ def _is_ear(flat: Sequence[complex], corner: tuple[int, int, int], others: Seque
     return not any(min(_cross(a, b, p), _cross(b, c, p), _cross(c, a, p)) >= 0 for p in rest)
 
 
-def write_glb(
-    meshes: Sequence[Mesh],
-    path: Path,
-    *,
-    origin: ArrayLike,
-    crs: str,
-    extras: Mapping[str, Any] | None = None,
-    plain: bool = False,
-) -> None:
-    """Write rows as binary glTF: metres, Y up, one node and one mesh a row.
-
-    The root node turns Z up to Y up and holds ``crs`` and ``origin`` in its extras; each row's node, named by its
-    label, is moved to the row's middle. Faces are shaded flat (no normals).
-
-    Positions are 16-bit steps of 1/65534 of the row's longest side, 1.8 mm in 120 m, that the node scales to metres
-    (KHR_mesh_quantization). Each lofted piece is a primitive: one triangle strip that closes it, caps included, without
-    triangles of repeated vertices. Its quadrilaterals are those of Eq. 22, some split along the other diagonal. Other
-    meshes are lists of triangles.
-
-    Parameters
-    ----------
-    meshes : sequence of Mesh
-        Rows; those without faces get a node without a mesh.
-    path : Path
-        File to write.
-    origin : array_like of shape (3,)
-        Point of the CRS (x, y, z) that becomes (0, 0, 0), m.
-    crs : str
-        The horizontal CRS, "EPSG:32632".
-    extras : mapping, optional
-        More for the root node: vertical datum ("vertical"), parcel, survey.
-    plain : bool
-        Write float32 positions, to micrometres, and one list of triangles a row, the mesh's own faces, for readers
-        that know no extensions: a file twice as large.
-
-    References
-    ----------
-    https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_mesh_quantization
-    """
-    import pygltflib as gltf  # 100 ms, for one function
-
-    zero = np.asarray(origin, dtype=np.float64)
-    placed = {"crs": crs, **(extras or {}), "origin": zero}
-    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=jsonable(placed))
-    out = gltf.GLTF2(
-        asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
-        scene=0,
-        scenes=[gltf.Scene(nodes=[0])],
-        nodes=[root],
-    )
-    positions, indices = bytearray(), bytearray()
-    stored: dict[bytes, int] = {}
-    for mesh in meshes:
-        node = gltf.Node(name=mesh.label, extras=jsonable({"row_id": mesh.row_id, **mesh.extras}))
-        out.nodes.append(node)
-        if len(mesh.faces) == 0:
-            continue
-        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-        node.translation = (middle - zero).tolist()
-        node.mesh = len(out.meshes)
-        local, pieces = (mesh.vertices - middle).astype("<f4"), () if plain else mesh.pieces
-        if not plain:
-            local, step = _quantise(mesh.vertices - middle)
-            node.scale = [step] * 3
-        ends = np.cumsum([piece.sections * piece.corners for piece in pieces])
-        orders = [_strip(*piece) for piece in pieces] or [mesh.faces.ravel()]
-        mode, primitives = gltf.TRIANGLE_STRIP if pieces else gltf.TRIANGLES, []
-        for points, order in zip(np.split(local, ends[:-1]), orders, strict=True):
-            # 65535 is the primitive restart value.
-            kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(points) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
-            drawn = order.astype(kind).tobytes()
-            if drawn not in stored:
-                stored[drawn] = len(out.accessors)
-                indices += b"\0" * (-len(indices) % 4)
-                out.accessors.append(
-                    gltf.Accessor(
-                        bufferView=1, byteOffset=len(indices), componentType=code, count=len(order), type=gltf.SCALAR
-                    )
-                )
-                indices += drawn
-            out.accessors.append(
-                gltf.Accessor(
-                    bufferView=0,
-                    byteOffset=len(positions),
-                    componentType=gltf.FLOAT if plain else gltf.SHORT,
-                    count=len(points),
-                    type=gltf.VEC3,
-                    min=points[:, :3].min(axis=0).tolist(),
-                    max=points[:, :3].max(axis=0).tolist(),
-                )
-            )
-            positions += points.tobytes()
-            attributes = gltf.Attributes(POSITION=len(out.accessors) - 1)
-            primitives.append(gltf.Primitive(attributes=attributes, indices=stored[drawn], material=0, mode=mode))
-        out.meshes.append(gltf.Mesh(name=mesh.label, primitives=primitives))
-    root.children = list(range(1, len(out.nodes)))
-    if out.meshes:
-        if not plain:
-            out.extensionsUsed = out.extensionsRequired = ["KHR_mesh_quantization"]
-        out.materials = [
-            gltf.Material(
-                name="foliage",
-                pbrMetallicRoughness=gltf.PbrMetallicRoughness(
-                    baseColorFactor=GREEN, metallicFactor=0.0, roughnessFactor=0.9
-                ),
-            )
-        ]
-        out.bufferViews = [
-            gltf.BufferView(
-                buffer=0,
-                byteOffset=0,
-                byteLength=len(positions),
-                byteStride=12 if plain else 8,
-                target=gltf.ARRAY_BUFFER,
-            ),
-            gltf.BufferView(
-                buffer=0, byteOffset=len(positions), byteLength=len(indices), target=gltf.ELEMENT_ARRAY_BUFFER
-            ),
-        ]
-        out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
-    # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
-    document = out.gltf_to_json(separators=(",", ":"), indent=None).encode()
-    binary = _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
-    chunks = _chunk(b"JSON", document, b" ") + binary
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-
-
-def _quantise(centred: Vertices) -> tuple[NDArray[np.int16], float]:
-    """Vertices (n, 3) about 0 as numbers of steps (n, 4), the last 0 to fill 8 bytes, and the step's length, m."""
-    step = float(np.abs(centred).max()) / 32767 or 1.0
-    return np.pad(np.rint(centred / step), [(0, 0), (0, 1)]).astype("<i2"), step
-
-
-def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
-    """One triangle strip (2 * k * c - 2,) that closes a piece of k sections of c corners, outward.
-
-    Numbered ring by ring, it goes from vertex n to n + c, n + 1 and on up the sides as a helix; below the first vertex
-    and above the last it folds back, and zigzags across the cap. Rings are numbered so that it faces outward, and that
-    the caps' triangles have no tip at corner 0, which may lie on its neighbours' line (unless c < 5).
-    """
-    last, over, odd = sections * corners - 1, corners // 2, corners % 2 == 1
-    n = np.arange(-over, last - corners + over + 1)
-    strip = np.column_stack([abs(n), last - abs(last - corners - n)]).ravel()
-    strip = strip if odd else strip[1:-1]  # where it folds, an even ring has one vertex, not two
-    return strip - strip % corners + (strip - 1 if turned == odd else 1 - strip) % corners
-
-
-def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:
-    data += pad * (-len(data) % 4)
-    return struct.pack("<I4s", len(data), kind) + data
-
-
 def audit(mesh: Mesh) -> Audit:
     """Check a mesh with Open3D.
 
@@ -338,3 +183,40 @@ def audit(mesh: Mesh) -> Audit:
         bool(shape.is_self_intersecting()),
         volume(mesh) if watertight else math.nan,
     )
+
+
+def _breaks(row_id: NDArray[np.int64], position: Values, step: float) -> Flags:
+    """Whether the canopy ends (m - 1,) between consecutive sections (m,): another row, or more than one lacks."""
+    out: Flags = (np.diff(row_id) != 0) | (np.diff(position) > 2.5 * step)
+    return out
+
+
+def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *, step: float) -> list[Mesh]:
+    """Closed meshes of the rows' canopies: polygons of consecutive sections, joined (Eq. 20–22).
+
+    A mesh closes and starts anew where more than one section lacks.
+
+    Parameters
+    ----------
+    canopy : Sections
+        m sections in order of row and position.
+    polygons : (m, c, 2) array
+        Their c-gons.
+    rows : GeoDataFrame
+        Rows with ``row_id`` and ``label``; their numbers go with the meshes.
+    step : float
+        Metres between sections.
+    """
+    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
+    corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
+    breaks = _breaks(canopy.row_id, canopy.position, step)
+    pieces: dict[int, list[Any]] = {}
+    for run in np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1):
+        if len(run) > 1:
+            pieces.setdefault(int(canopy.row_id[run[0]]), []).append(loft(corners[run]))
+    numbers = rows.drop(columns="geometry").to_dict("records")
+    return [
+        Mesh(*merge(pieces[row["row_id"]]), row_id=int(row["row_id"]), label=str(row["label"]), extras=row)
+        for row in numbers
+        if row["row_id"] in pieces
+    ]

@@ -8,13 +8,14 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.cloud.points import Sections
+    from vinemap.canopy.points import Sections
 
     Values = NDArray[np.floating]
 

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.cloud.points import Sections
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.canopy.points import Sections
+from vinemap.cloud.frame import points_of_rows
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
+from vinemap.geo.curve import at, tangents
 from vinemap.geo.raster import sample
-from vinemap.rows.frame import at, points_of_rows, tangents
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,10 +21,10 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
+    from vinemap.cloud.frame import Taken
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.raster import Raster
-    from vinemap.rows.frame import Taken
 
     Values = NDArray[np.floating]
 

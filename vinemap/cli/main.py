@@ -88,8 +88,9 @@ def run(
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
     from vinemap import paths
+    from vinemap.config.names import check_name
     from vinemap.config.settings import Settings
-    from vinemap.config.surveys import check_name, load_settings
+    from vinemap.config.surveys import load_settings
     from vinemap.geo.crs import parse_crs
 
     name = check_name(parcel) if parcel is not None else paths.stem(cloud)
@@ -181,7 +182,8 @@ def config(kind: str) -> None:
 @click.option("--pairs", type=FILE, help="GeoPackage to write: matched, extra and missed rows with their indices.")
 def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None, pairs: Path | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
-    from vinemap.evaluate.rows import as_layer, evaluate_rows, format_table, read_lines
+    from vinemap.evaluate.rows import as_layer, evaluate_rows, format_table
+    from vinemap.geo.lines import read_lines
     from vinemap.product.geopackage import write_layer
 
     found, drawn = read_lines(result), read_lines(reference, layer, parcel=parcel)
@@ -247,7 +249,7 @@ def track(
     method: Any,
 ) -> None:
     """Follow a robot by the FRAMES of its camera that looks down: images, folders of images, or videos, in order."""
-    from vinemap.config.surveys import load_camera
+    from vinemap.config.drives import load_camera
     from vinemap.odometry.drive import map_drive
 
     summary = map_drive(

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.raster import cell_of
 
 if TYPE_CHECKING:

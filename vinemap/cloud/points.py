@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vinemap.cloud.bins import bin_points
-from vinemap.compute.threads import compiled, in_threads, stretches
 from vinemap.geo.raster import above, extent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     import shapely
     from numpy.typing import NDArray
@@ -73,105 +72,3 @@ class PointCloud:
     def above(self, dtm: Raster) -> PointCloud:
         """The cloud with its heights above a terrain model."""
         return replace(self, heights=above(dtm, self.xyz))
-
-
-class Sections(NamedTuple):
-    """Sections S_k of all rows, ordered by row and position, with their points one after the other.
-
-    Points ``start[k]`` to ``start[k + 1]`` are those of section k; a point may be in two sections (a > b).
-    """
-
-    row_id: NDArray[np.int64]
-    """Row (m,) of each section."""
-    position: Values
-    """Metres (m,) along γ."""
-    origin: Values
-    """Points (m, 3) of γ at soil level in the parcel's CRS: the origins of {LOC_k}."""
-    tangent: Values
-    """Horizontal unit vectors (m, 2) along γ: the x axes of {LOC_k}."""
-    spacing: Values
-    """Local inter-row spacing δ (m,) in metres."""
-    start: NDArray[np.int64]
-    """First point (m + 1,) of each section."""
-    points: Values
-    """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
-    height: Values
-    """Height above the terrain model (n,) in metres."""
-    member: NDArray[np.int32]
-    """Index (n,) of each point in the cloud; it climbs within a section."""
-
-    def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_] | None = None) -> Sections:
-        """The points (n,) and sections (m,; by default all) that are flagged; no point of another section may be."""
-        sections = np.ones(len(self.row_id), dtype=bool) if sections is None else sections
-        n = np.zeros(len(sections), dtype=np.int64)
-        in_threads(lambda part: _count_flags(*part, points, self.start, n), stretches(len(n)))
-        start = np.concatenate([[0], np.cumsum(n)])
-        kept, height = np.empty((start[-1], 2)), np.empty(start[-1], dtype=self.height.dtype)
-        member = np.empty(start[-1], dtype=self.member.dtype)
-        old, new = (self.points, self.height, self.member), (kept, height, member)
-        in_threads(lambda part: _take_flagged(*part, points, self.start, start, old, new), stretches(len(n)))
-        return Sections(
-            self.row_id[sections],
-            self.position[sections],
-            self.origin[sections],
-            self.tangent[sections],
-            self.spacing[sections],
-            np.concatenate([[0], np.cumsum(n[sections])]),
-            kept,
-            height,
-            member,
-        )
-
-    def without_points(self) -> Sections:
-        """The sections as places."""
-        return Sections(*self[:5], np.zeros_like(self.start), self.points[:0], self.height[:0], self.member[:0])
-
-
-NO_SECTIONS = Sections(
-    np.empty(0, dtype=np.int64),
-    np.empty(0),
-    np.empty((0, 3)),
-    np.empty((0, 2)),
-    np.empty(0),
-    np.zeros(1, dtype=np.int64),
-    np.empty((0, 2)),
-    np.empty(0, dtype=np.float32),
-    np.empty(0, dtype=np.int32),
-)
-
-
-def join(parts: Sequence[Sections]) -> Sections:
-    """Sections of several rows, or groups of rows, as one; there must be one group at the least."""
-    table = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Sections._fields}
-    n = np.concatenate([np.diff(part.start) for part in parts])
-    return Sections(**table | {"start": np.concatenate([[0], np.cumsum(n)])})
-
-
-@compiled
-def _count_flags(
-    first: int, last: int, flags: NDArray[np.bool_], start: NDArray[np.int64], n: NDArray[np.int64]
-) -> None:
-    for k in range(first, last):
-        for p in range(start[k], start[k + 1]):
-            n[k] += flags[p]
-
-
-@compiled
-def _take_flagged(
-    first: int,
-    last: int,
-    flags: NDArray[np.bool_],
-    start: NDArray[np.int64],
-    place: NDArray[np.int64],
-    old: tuple[Values, Values, NDArray[np.int32]],
-    new: tuple[Values, Values, NDArray[np.int32]],
-) -> None:
-    points, height, member = old
-    kept, kept_height, kept_member = new
-    for k in range(first, last):
-        at = place[k]
-        for p in range(start[k], start[k + 1]):
-            if flags[p]:
-                kept[at, 0], kept[at, 1] = points[p, 0], points[p, 1]  # a row at once would be far slower
-                kept_height[at], kept_member[at] = height[p], member[p]
-                at += 1

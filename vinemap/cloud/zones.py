@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from scipy.ndimage import binary_dilation
 
-from vinemap.compute.threads import compiled
+from vinemap.compute.compiled import compiled
 from vinemap.geo.raster import Grid, window
 
 if TYPE_CHECKING:

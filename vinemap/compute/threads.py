@@ -1,8 +1,4 @@
-"""Loops over points, compiled, and run on all cores.
-
-Compiled functions are cached on disk and run without the GIL. They call only others of their own file, because the
-cache doesn't notice changes in another.
-"""
+"""Work in threads: on all cores where it lets go of the GIL, and ahead of what is needed."""
 
 from __future__ import annotations
 
@@ -12,30 +8,19 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar, cast
-
-from numba import njit
+from typing import TYPE_CHECKING, TypeVar
 
 from vinemap.compute import machine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-F = TypeVar("F", bound="Callable[..., object]")
 S = TypeVar("S")
 T = TypeVar("T")
 
 FEW = 16
 """Items that one core has done before another would have begun."""
 _here = threading.local()
-
-
-def compiled(function: F) -> F:
-    """Compile a function at its first call."""
-    try:
-        return cast("F", njit(cache=True, nogil=True)(function))
-    except RuntimeError:  # no folder for the cache can be written: compile anew each time
-        return cast("F", njit(nogil=True)(function))
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:

@@ -12,9 +12,8 @@ from pyproj import CRS
 from vinemap import paths
 from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
-from vinemap.export.meshes import place_canopies
+from vinemap.export.meshes import place_canopies, write_obj
 from vinemap.geo.crs import to_main
-from vinemap.product.gltf import write_obj
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from vinemap.export.neighbours import STEP, aligned, belonging, look, pair_rows
-from vinemap.rows.frame import extend, way_along
+from vinemap.geo.curve import extend, way_along
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap.rows.frame import at, tangents, way_along
+from vinemap.geo.curve import at, tangents, way_along
 
 if TYPE_CHECKING:
     import geopandas as gpd

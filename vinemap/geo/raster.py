@@ -6,20 +6,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from affine import Affine
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import ArrayLike, NDArray
     from pyproj import CRS
 
 MAX_CELLS = 80_000_000
 """Cells of the finest raster, 0.8 km² at 0.1 m."""
-NODATA = -9999.0
 
 
 class Grid(NamedTuple):
@@ -256,41 +253,3 @@ def _bilinear_across(
         for k in range(len(offsets)):
             x, y = origin[p, 0] + offsets[k] * normal[p, 0], origin[p, 1] + offsets[k] * normal[p, 1]
             out[p, k] = _value(values, grid, x, y)
-
-
-def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resampling: str = "average") -> None:
-    """Write a float32 Cloud Optimized GeoTIFF with nodata, overviews, description and unit of its band.
-
-    ``resampling`` makes the overviews: angles have no average, so they want "nearest".
-
-    Raises
-    ------
-    OSError
-        If it can't be written.
-    """
-    import rasterio  # half a second of start-up, needed only here
-    from rasterio.io import MemoryFile
-    from rasterio.shutil import copy
-
-    grid = raster.grid
-    values = np.where(np.isfinite(raster.values), raster.values, NODATA).astype(np.float32)
-    profile = {
-        "driver": "GTiff",
-        "dtype": "float32",
-        "count": 1,
-        "height": grid.ny,
-        "width": grid.nx,
-        "nodata": NODATA,
-        "crs": raster.crs.to_wkt(),
-        "transform": Affine(grid.resolution, 0, grid.west, 0, -grid.resolution, grid.north),
-    }
-    options = {"compress": "DEFLATE", "predictor": "YES", "blocksize": 256, "overview_resampling": resampling}
-    # GDAL writes to memory and Python to the disk, as a full disk would make GDAL talk on the terminal.
-    with rasterio.Env(GDAL_PAM_ENABLED=False), MemoryFile() as plain, MemoryFile() as cog:
-        with plain.open(**profile) as target:
-            target.write(values, 1)
-            target.set_band_description(1, description)
-            target.set_band_unit(1, unit)
-            target.update_tags(AREA_OR_POINT="Area")
-        copy(plain.name, cog.name, driver="COG", **options)
-        path.write_bytes(cog.read())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
 from vinemap.cloud.las_end import unfinished
-from vinemap.config.surveys import check_name
+from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import __version__, paths
-from vinemap.config.surveys import check_name
+from vinemap.config.names import check_name
 from vinemap.errors import ConfigError, InputError
+from vinemap.geo.boundaries import read_parcels
 from vinemap.geo.crs import parse_crs
 from vinemap.parcel import found
-from vinemap.product.geopackage import read_parcels
 from vinemap.product.recipe import Recipe, Source, flown, product_in, read_source
 from vinemap.product.store import write_whole
 

@@ -20,9 +20,9 @@ from vinemap.cli.main import FILE, plain_errors
 from vinemap.cloud.las import read_cloud
 from vinemap.config.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.errors import InputError
+from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_rows, model_canopies
-from vinemap.product.geopackage import read_boundary
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,14 +8,15 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError, OutputError
-from vinemap.evaluate.rows import read_lines
 from vinemap.geo.crs import WGS84, metric_crs
+from vinemap.geo.lines import read_lines
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, beside_rows, track_layers
 from vinemap.odometry.poses import STILL
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow
-from vinemap.product.geopackage import TRACK_LAYERS, write_geopackage
+from vinemap.product.geopackage import write_geopackage
+from vinemap.product.layers import TRACK_LAYERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from vinemap.config.camera import Camera
     from vinemap.geo.crs import Start
     from vinemap.odometry.frames import Frame
-    from vinemap.odometry.step import Method
+    from vinemap.odometry.refinement import Method
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 

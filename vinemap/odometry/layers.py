@@ -36,7 +36,7 @@ FARTHEST = 2000.0
 
 
 def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
-    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.product.geopackage.TRACK_LAYERS`, without rows.
+    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.product.layers.TRACK_LAYERS`, without rows.
 
     Parameters
     ----------

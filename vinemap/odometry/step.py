@@ -17,59 +17,34 @@ from vinemap.odometry.correlation import (
     Search,
     climb,
     coarse_peaks,
-    correlation,
-    near,
     peak,
     place_at,
     search_of,
-    warp,
 )
+from vinemap.odometry.judgement import LEAST_AGREEMENT, LEAST_SCORE, LEAST_SHARPNESS, MOST_RIVAL, agreement_at
 from vinemap.odometry.poses import Pose, onward
+from vinemap.odometry.refinement import Method, refine
+from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from vinemap.config.camera import Camera
-    from vinemap.odometry.correlation import Index
 
     Array = NDArray[np.floating]
     Image = NDArray[np.uint8]
 
-Method = Literal["aligned", "quadratic", "centroid", "maximum"]
 Strategy = Literal["coarse to fine", "exhaustive"]
 ANGLES = (-9.0, 9.0)
 """Degrees that a robot turns by from one frame to the next (Section 4.4)."""
-
 ANGLE_STEP = 1.15
 """Degrees between the angles of the search: what moves the edge of a template of 49 pixels by half a pixel."""
-SMOOTHING, SMOOTHED_SIZE = 1.0, 240
-"""Sigma in pixels of the Gaussian that both frames get, as interpolation blurs the turned template, and only that one;
-it grows with frames whose shorter side has more pixels than that, so that all see the ground's relief alike."""
-NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95
-"""n_Γ and m of Eq. 9."""
-COARSE_SIZE = 60
-"""Pixels along the shorter side of the coarse frames, or a little more or less."""
 APART = 1.5
 """Pixels of the coarse frames between two places that aren't the same."""
-BACKGROUND = 4.0
-"""Sigma in pixels of the coarse frames of what is taken off as uneven light."""
-TURNED = 1.2
-"""Room that a square needs to turn by 9°, as a share of its half width."""
 SMALLEST_TEMPLATE = 5
 """Half width of a template in pixels."""
 LARGEST_SHARE = 0.8
 """p_T above which nothing is left to move in."""
-LEAST_CONTRAST = 1.0
-"""Standard deviation in grey levels below which a frame shows nothing."""
-LEAST_OVERLAP = 0.1
-"""Share of a frame that the next one must show too."""
-LEAST_SHARPNESS = 0.5
-"""Detail of the blurrier frame as a share of the other's."""
-LEAST_SCORE, LEAST_AGREEMENT, MOST_RIVAL = 0.5, 0.35, 0.7
-"""Of a step that is believed: correlation of the template, that of all that both frames show, and the share of the
-latter that the next best place may reach."""
 
 
 class Motion(NamedTuple):
@@ -96,20 +71,6 @@ class Motion(NamedTuple):
     def movement(self) -> Pose:
         """The next pose in the frame of the first."""
         return Pose(self.dx_mm, self.dy_mm, self.rotation_deg)
-
-
-class View(NamedTuple):
-    """A frame, ready to be compared with others."""
-
-    image: Array
-    """Smoothed, but for the standard algorithm."""
-    coarse: Array
-    detail: Array
-    """The coarse one without uneven light."""
-    contrast: float
-    """Standard deviation in grey levels."""
-    sharpness: float
-    """Its fine detail over its contrast."""
 
 
 def estimate_motion(
@@ -168,25 +129,6 @@ def estimate_motion(
     )
 
 
-def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View:
-    """Make a frame ready for :func:`motion_between`; InputError as of :func:`estimate_motion`."""
-    import cv2
-
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise InputError(f"A frame has shape {image.shape} of {image.dtype}: give grey images of 8 bits")
-    if image.shape != (camera.height, camera.width):
-        size = f"{image.shape[1]} × {image.shape[0]}"
-        raise InputError(f"A frame has {size} pixels, the camera {camera.width} × {camera.height}: give frames of one")
-    values = image.astype(np.float32)
-    sigma = SMOOTHING * max(1.0, min(image.shape) / SMOOTHED_SIZE)
-    smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
-    coarse = _reduced(values)
-    contrast = float(values.std())
-    sharpness = float(cv2.Laplacian(smooth, cv2.CV_32F).std()) / max(contrast, LEAST_CONTRAST)
-    kept = values if method == "maximum" else smooth
-    return View(kept, coarse, coarse - cv2.GaussianBlur(coarse, (0, 0), BACKGROUND), contrast, sharpness)
-
-
 def motion_between(
     view: View,
     next_view: View,
@@ -221,16 +163,16 @@ def motion_between(
     )
     if min(view.contrast, next_view.contrast) < LEAST_CONTRAST:
         return _motion(camera, centre, Place(0.0, *centre), flag="blank")
-    n = _coarseness(view.image)
+    n = coarseness(view.image)
     peaks = [climb(fine, place, n + 1) for place in _candidates(view, next_view, fine)]
     if search == "exhaustive":
         peaks.append(peak(fine, fine.whole))
-    agreed = {index: _agreement(view, next_view, centre, place_at(fine, index))[0] for index, _ in peaks}
+    agreed = {index: agreement_at(view, next_view, centre, place_at(fine, index))[0] for index, _ in peaks}
     top, score = max(peaks, key=lambda found: agreed[found[0]])
     others = [index for index in agreed if np.hypot(index[1] - top[1], index[2] - top[2]) > APART * n]
     rival = max((agreed[index] for index in others), default=0.0)
-    place = _refined(fine, top, method)
-    agreement, overlap = _agreement(view, next_view, centre, place)
+    place = refine(fine, top, method)
+    agreement, overlap = agreement_at(view, next_view, centre, place)
     at_limit, *out = (not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True))
     doubts = {
         "overlap": any(out),
@@ -287,25 +229,9 @@ def _motion(
     return Motion(float(dx), float(dy), place.angle, score, agreement, rival, overlap, flag)
 
 
-def _coarseness(image: Array) -> int:
-    """Pixels along the side of one of the coarse search's."""
-    shorter: int = min(image.shape)
-    return max(1, round(shorter / COARSE_SIZE))
-
-
-def _reduced(image: Array) -> Array:
-    """Means of squares of pixels."""
-    import cv2
-
-    n = _coarseness(image)
-    height, width = (size // n for size in image.shape)
-    whole = image[: height * n, : width * n]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
 def _candidates(view: View, next_view: View, fine: Search) -> list[Place]:
     """Where the template may be, by the coarse frames."""
-    n = _coarseness(view.image)
+    n = coarseness(view.image)
     row, column = (round((at + 0.5) / n - 0.5) for at in fine.centre)
     half = max(2, round(fine.half / n))
     angles = fine.whole[0][1] * fine.step, fine.whole[0][-2] * fine.step
@@ -322,100 +248,3 @@ def _candidates(view: View, next_view: View, fine: Search) -> list[Place]:
         Place(angle, fine.centre[0] + n * (i - row), fine.centre[1] + n * (j - column))
         for angle, i, j in coarse_peaks(coarse)
     ]
-
-
-def _refined(search: Search, top: Index, method: Method) -> Place:
-    """The peak between the steps of the search."""
-    match method:
-        case "maximum":
-            return place_at(search, top)
-        case "centroid":
-            return _centroid(search, top)
-        case "quadratic":
-            return _vertex(search, top)
-        case "aligned":
-            return _aligned(search, _vertex(search, top))
-
-
-def _around(search: Search, top: Index, reach: int) -> tuple[Array, Array]:
-    """Steps from a peak (n, 3), and the correlations there."""
-    box = near(search, top, (reach, reach, reach))
-    steps = np.stack(np.meshgrid(*box, indexing="ij"), axis=-1) - top
-    return steps.reshape(-1, 3), correlation(search, box).ravel()
-
-
-def _centroid(search: Search, top: Index) -> Place:
-    """Weighted centroid of Γ (Eq. 9–12)."""
-    steps, values = _around(search, top, NEIGHBOURS)
-    within = np.linalg.norm(steps, axis=1) <= NEIGHBOURS
-    chosen = within & (values >= SHARE_OF_PEAK * values[within].max())
-    return place_at(search, top + np.average(steps[chosen], axis=0, weights=values[chosen]))
-
-
-def _vertex(search: Search, top: Index) -> Place:
-    """Highest point of the quadratic that fits a peak's neighbours best."""
-    steps, values = _around(search, top, 1)
-    k, i, j = steps.T.astype(float)
-    terms = np.column_stack([np.ones_like(k), k, i, j, k * k, i * i, j * j, k * i, k * j, i * j])
-    _, *slope, kk, ii, jj, ki, kj, ij = np.linalg.lstsq(terms, values.astype(float))[0]
-    bend = np.array([[2 * kk, ki, kj], [ki, 2 * ii, ij], [kj, ij, 2 * jj]])
-    if np.any(np.linalg.eigvalsh(bend) >= 0):
-        return place_at(search, top)
-    return place_at(search, top - np.clip(np.linalg.solve(bend, slope), -1, 1))
-
-
-def _aligned(search: Search, place: Place) -> Place:
-    """The place at which the enhanced correlation coefficient is highest, near one; that one where there is none.
-
-    What is aligned is twice as wide as the template where both frames show so much.
-    """
-    import cv2
-
-    (row, column), (height, width) = search.centre, search.b.shape
-    room = min(
-        row,
-        column,
-        height - 1 - row,
-        width - 1 - column,
-        *(side / TURNED for side in (place.row, place.column, height - 1 - place.row, width - 1 - place.column)),
-    )
-    half = max(search.half, min(2 * search.half, int(room)))
-    far = int(np.ceil(half * TURNED)) + 2
-    template = search.a[row - half : row + half + 1, column - half : column + half + 1]
-    top, left = (max(0, round(value) - far) for value in place[1:])
-    part = search.b[top : round(place.row) + far + 1, left : round(place.column) + far + 1]
-    matrix = warp(-place.angle, (place.row - top, place.column - left), (half, half)).astype(np.float32)
-    whole = np.full(part.shape, 255, np.uint8)
-    enough = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-5)
-    try:
-        _, found = cv2.findTransformECC(template, part, matrix, cv2.MOTION_EUCLIDEAN, enough, whole, 1)
-    except cv2.error:  # it doesn't converge
-        return place
-    matrix = np.asarray(found)
-    x, y = matrix @ (half, half, 1)
-    aligned = Place(float(np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))), float(y) + top, float(x) + left)
-    near_by = np.hypot(aligned.row - place.row, aligned.column - place.column) < 1
-    return aligned if near_by and abs(aligned.angle - place.angle) < search.step else place
-
-
-def _agreement(view: View, next_view: View, centre: Sequence[float], place: Place) -> tuple[float, float]:
-    """Correlation of all that two coarse frames both show, and its share of a frame.
-
-    It is the quadrant correlation, as Pearson's for normal values, which a few dark or bright spots that move with the
-    camera can't decide: N. Blomqvist, On a measure of dependence between two random variables, 1950.
-    """
-    import cv2
-
-    a, b = view.detail, next_view.detail
-    n = _coarseness(view.image)
-    source, target = ((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:]))
-    matrix = warp(place.angle, source, target)
-    size, flags = b.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    moved = cv2.warpAffine(a, matrix, size, flags=flags)
-    shown = cv2.warpAffine(np.ones_like(a), matrix, size, flags=flags) > 0.999
-    overlap = float(shown.mean())
-    if overlap < LEAST_OVERLAP:
-        return 0.0, overlap
-    x, y = moved[shown], b[shown]
-    quadrants = np.mean(np.sign(x - np.median(x)) * np.sign(y - np.median(y)))
-    return float(np.sin(np.pi / 2 * quadrants)), overlap

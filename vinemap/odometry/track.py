@@ -6,14 +6,17 @@ from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap.odometry.poses import STILL, Pose, moved, onward
-from vinemap.odometry.step import ANGLES, LEAST_CONTRAST, expected_overlap, motion_between, view_of
+from vinemap.odometry.step import ANGLES, expected_overlap, motion_between
+from vinemap.odometry.views import LEAST_CONTRAST, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from vinemap.config.camera import Camera
     from vinemap.odometry.frames import Frame
-    from vinemap.odometry.step import Method, Motion, View
+    from vinemap.odometry.refinement import Method
+    from vinemap.odometry.step import Motion
+    from vinemap.odometry.views import View
 
 KEY_OVERLAP = 0.4
 """Share of a frame that a keyframe must have in common with the frames that are measured from it."""

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import vinemap
 from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
 from vinemap.geo.crs import parse_crs
+from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
     from pyproj import CRS
+
+    Vertices = NDArray[np.float64]
 
 STRIP = 5
 """glTF's mode of triangle strips."""
+Z_UP_TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+"""Quaternion (x, y, z, w) that takes x east, y north, z up to glTF's x east, y up, z south."""
+GREEN = [0.13, 0.33, 0.07, 1.0]
+"""Linear RGBA of foliage."""
 
 
 class Canopies(NamedTuple):
@@ -35,7 +44,7 @@ class Canopies(NamedTuple):
 
 
 def read_glb(path: Path) -> Canopies:
-    """Read what :func:`vinemap.canopy.mesh.write_glb` wrote, quantised and in strips or plain.
+    """Read what :func:`vinemap.product.gltf.write_glb` wrote, quantised and in strips or plain.
 
     Raises
     ------
@@ -91,67 +100,153 @@ def _triangles(strip: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.compress((a != b) & (b != c) & (c != a), faces, axis=0)
 
 
-def write_ply(meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str] = ()) -> None:
-    """Write meshes as one binary PLY, little-endian: float32 positions and the ``row_id`` of every vertex.
-
-    Parameters
-    ----------
-    meshes : sequence of Mesh
-        In a frame whose origin is near: float32 has steps of 0.06 mm at 1 km.
-    path : Path
-        File to write.
-    comments : sequence of str
-        Lines for its header.
-    """
-    vertices = np.empty(sum(len(mesh.vertices) for mesh in meshes), [("xyz", "<f4", 3), ("row_id", "<i4")])
-    faces = np.empty(sum(len(mesh.faces) for mesh in meshes), [("n", "u1"), ("corners", "<i4", 3)])
-    faces["n"], first, n = 3, 0, 0
-    for mesh in meshes:
-        vertices["xyz"][first : first + len(mesh.vertices)] = mesh.vertices
-        vertices["row_id"][first : first + len(mesh.vertices)] = mesh.row_id
-        faces["corners"][n : n + len(mesh.faces)] = mesh.faces + first
-        first, n = first + len(mesh.vertices), n + len(mesh.faces)
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"comment {line}" for line in comments),
-        f"element vertex {len(vertices)}",
-        *(f"property float {axis}" for axis in "xyz"),
-        "property int row_id",
-        f"element face {len(faces)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
-    path.write_bytes("\n".join(header).encode("ascii", "replace") + vertices.tobytes() + faces.tobytes())
-
-
-def write_obj(
-    meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str] = (), material: tuple[str, str] | None = None
+def write_glb(
+    meshes: Sequence[Mesh],
+    path: Path,
+    *,
+    origin: ArrayLike,
+    crs: str,
+    extras: Mapping[str, Any] | None = None,
+    plain: bool = False,
 ) -> None:
-    """Write meshes as Wavefront OBJ, one object a row, named by its label; coordinates in tenths of a millimetre.
+    """Write rows as binary glTF: metres, Y up, one node and one mesh a row.
+
+    The root node turns Z up to Y up and holds ``crs`` and ``origin`` in its extras; each row's node, named by its
+    label, is moved to the row's middle. Faces are shaded flat (no normals).
+
+    Positions are 16-bit steps of 1/65534 of the row's longest side, 1.8 mm in 120 m, that the node scales to metres
+    (KHR_mesh_quantization). Each lofted piece is a primitive: one triangle strip that closes it, caps included, without
+    triangles of repeated vertices. Its quadrilaterals are those of Eq. 22, some split along the other diagonal. Other
+    meshes are lists of triangles.
 
     Parameters
     ----------
     meshes : sequence of Mesh
-        Rows; those without faces are left out.
+        Rows; those without faces get a node without a mesh.
     path : Path
         File to write.
-    comments : sequence of str
-        Lines for its beginning.
-    material : (str, str), optional
-        Name of a file of materials beside it, and of the material in it.
+    origin : array_like of shape (3,)
+        Point of the CRS (x, y, z) that becomes (0, 0, 0), m.
+    crs : str
+        The horizontal CRS, "EPSG:32632".
+    extras : mapping, optional
+        More for the root node: vertical datum ("vertical"), parcel, survey.
+    plain : bool
+        Write float32 positions, to micrometres, and one list of triangles a row, the mesh's own faces, for readers
+        that know no extensions: a file twice as large.
+
+    References
+    ----------
+    https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_mesh_quantization
     """
-    lines = [f"# {line}" for line in comments]
-    if material:
-        lines.append(f"mtllib {material[0]}")
-    first = 1
+    import pygltflib as gltf  # 100 ms, for one function
+
+    zero = np.asarray(origin, dtype=np.float64)
+    placed = {"crs": crs, **(extras or {}), "origin": zero}
+    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=jsonable(placed))
+    out = gltf.GLTF2(
+        asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
+        scene=0,
+        scenes=[gltf.Scene(nodes=[0])],
+        nodes=[root],
+    )
+    positions, indices = bytearray(), bytearray()
+    stored: dict[bytes, int] = {}
     for mesh in meshes:
+        node = gltf.Node(name=mesh.label, extras=jsonable({"row_id": mesh.row_id, **mesh.extras}))
+        out.nodes.append(node)
         if len(mesh.faces) == 0:
             continue
-        lines.append(f"o {mesh.label}")
-        lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()]
-        if material:
-            lines.append(f"usemtl {material[1]}")
-        lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + first).tolist()]
-        first += len(mesh.vertices)
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+        node.translation = (middle - zero).tolist()
+        node.mesh = len(out.meshes)
+        local, pieces = (mesh.vertices - middle).astype("<f4"), () if plain else mesh.pieces
+        if not plain:
+            local, step = _quantise(mesh.vertices - middle)
+            node.scale = [step] * 3
+        ends = np.cumsum([piece.sections * piece.corners for piece in pieces])
+        orders = [_strip(*piece) for piece in pieces] or [mesh.faces.ravel()]
+        mode, primitives = gltf.TRIANGLE_STRIP if pieces else gltf.TRIANGLES, []
+        for points, order in zip(np.split(local, ends[:-1]), orders, strict=True):
+            # 65535 is the primitive restart value.
+            kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(points) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
+            drawn = order.astype(kind).tobytes()
+            if drawn not in stored:
+                stored[drawn] = len(out.accessors)
+                indices += b"\0" * (-len(indices) % 4)
+                out.accessors.append(
+                    gltf.Accessor(
+                        bufferView=1, byteOffset=len(indices), componentType=code, count=len(order), type=gltf.SCALAR
+                    )
+                )
+                indices += drawn
+            out.accessors.append(
+                gltf.Accessor(
+                    bufferView=0,
+                    byteOffset=len(positions),
+                    componentType=gltf.FLOAT if plain else gltf.SHORT,
+                    count=len(points),
+                    type=gltf.VEC3,
+                    min=points[:, :3].min(axis=0).tolist(),
+                    max=points[:, :3].max(axis=0).tolist(),
+                )
+            )
+            positions += points.tobytes()
+            attributes = gltf.Attributes(POSITION=len(out.accessors) - 1)
+            primitives.append(gltf.Primitive(attributes=attributes, indices=stored[drawn], material=0, mode=mode))
+        out.meshes.append(gltf.Mesh(name=mesh.label, primitives=primitives))
+    root.children = list(range(1, len(out.nodes)))
+    if out.meshes:
+        if not plain:
+            out.extensionsUsed = out.extensionsRequired = ["KHR_mesh_quantization"]
+        out.materials = [
+            gltf.Material(
+                name="foliage",
+                pbrMetallicRoughness=gltf.PbrMetallicRoughness(
+                    baseColorFactor=GREEN, metallicFactor=0.0, roughnessFactor=0.9
+                ),
+            )
+        ]
+        out.bufferViews = [
+            gltf.BufferView(
+                buffer=0,
+                byteOffset=0,
+                byteLength=len(positions),
+                byteStride=12 if plain else 8,
+                target=gltf.ARRAY_BUFFER,
+            ),
+            gltf.BufferView(
+                buffer=0, byteOffset=len(positions), byteLength=len(indices), target=gltf.ELEMENT_ARRAY_BUFFER
+            ),
+        ]
+        out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
+    # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
+    document = out.gltf_to_json(separators=(",", ":"), indent=None).encode()
+    binary = _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
+    chunks = _chunk(b"JSON", document, b" ") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _quantise(centred: Vertices) -> tuple[NDArray[np.int16], float]:
+    """Vertices (n, 3) about 0 as numbers of steps (n, 4), the last 0 to fill 8 bytes, and the step's length, m."""
+    step = float(np.abs(centred).max()) / 32767 or 1.0
+    return np.pad(np.rint(centred / step), [(0, 0), (0, 1)]).astype("<i2"), step
+
+
+def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
+    """One triangle strip (2 * k * c - 2,) that closes a piece of k sections of c corners, outward.
+
+    Numbered ring by ring, it goes from vertex n to n + c, n + 1 and on up the sides as a helix; below the first vertex
+    and above the last it folds back, and zigzags across the cap. Rings are numbered so that it faces outward, and that
+    the caps' triangles have no tip at corner 0, which may lie on its neighbours' line (unless c < 5).
+    """
+    last, over, odd = sections * corners - 1, corners // 2, corners % 2 == 1
+    n = np.arange(-over, last - corners + over + 1)
+    strip = np.column_stack([abs(n), last - abs(last - corners - n)]).ravel()
+    strip = strip if odd else strip[1:-1]  # where it folds, an even ring has one vertex, not two
+    return strip - strip % corners + (strip - 1 if turned == odd else 1 - strip) % corners
+
+
+def _chunk(kind: bytes, data: bytes, pad: bytes) -> bytes:
+    data += pad * (-len(data) % 4)
+    return struct.pack("<I4s", len(data), kind) + data

@@ -15,7 +15,7 @@ from vinemap import __version__, paths
 from vinemap.cloud.las import date_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
-from vinemap.product.geopackage import read_boundary
+from vinemap.geo.boundaries import read_boundary
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -14,7 +14,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -15,9 +15,11 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from vinemap.compute.threads import compiled, in_threads
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads
+from vinemap.geo.curve import between, extend, normals, resample
 from vinemap.geo.raster import Raster, sample_across
-from vinemap.rows.frame import between, centre_line, extend, half_width, normals, resample, runs_above, whittaker
+from vinemap.rows.centre_line import centre_line, half_width, runs_above, whittaker
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

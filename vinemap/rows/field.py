@@ -7,23 +7,18 @@ spectrum lies across the rows at one cycle a spacing (Delenne et al. 2008; the t
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from numpy.lib.stride_tricks import sliding_window_view
-from scipy import sparse
-from scipy.fft import fft, irfft, rfft
 from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
-from vinemap.compute.threads import compiled, in_threads
+from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, RowField, coarser
-from vinemap.rows.frame import at
+from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, scan_cylinders, scan_spectrum
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -31,25 +26,6 @@ if TYPE_CHECKING:
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
-COVER_RESOLUTION = 0.25
-"""Cell size in metres of the cover whose spectrum is taken."""
-NEAR, LEAST_COVER = 2.5, 0.02
-"""Metres from canopy, and what cover is canopy, within which there may be rows."""
-PADDING = 2
-"""Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
-HARMONICS = 3
-"""Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
-CYLINDER_TURN = 1.0
-"""Degrees between the directions in which a cylinder is sliced."""
-BATCH = 128
-
-
-class _Peaks(NamedTuple):
-    """Wave of each window (my, mx): direction of the rows in radians, spacing in metres, strength 0–1."""
-
-    direction: Values
-    spacing: Values
-    strength: Values
 
 
 def estimate_row_field(
@@ -83,7 +59,7 @@ def estimate_row_field(
     """
     base = _block_mean(cover, COVER_RESOLUTION)
     band = (min_spacing, max_spacing)
-    scan, size = (_scan_cylinders, radius) if method == "cylinders" else (_scan_spectrum, window)
+    scan, size = (scan_cylinders, radius) if method == "cylinders" else (scan_spectrum, window)
     peaks = scan(base.values, size, step, band)
     peaks = _axial_median(peaks)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
@@ -105,160 +81,7 @@ def _block_mean(raster: Raster, resolution: float) -> Raster:
     return Raster(mean, grid, raster.crs)
 
 
-def _scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> _Peaks:
-    """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
-    windows, occupied, shape = _windows(cover, round(window / COVER_RESOLUTION / 2), step)
-    hann = np.hanning(windows.shape[-1] + 1)[:-1]
-    taper = (hann[:, None] * hann).astype(np.float32)
-    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    waves = in_threads(lambda batch: _strongest_wave(windows[batch], taper, band), batches)
-    return _peaks(waves, occupied, shape)
-
-
-def _scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> _Peaks:
-    """Direction across which the histogram of the cover in a cylinder varies most, and the period of that histogram.
-
-    The thesis scans cylinders so (section 2.3.1); its test, of Comba et al. (2015), is taken as the histogram's
-    variance, and the likelihood as its autocorrelation at one period.
-    """
-    half = int(np.ceil(radius / COVER_RESOLUTION))
-    windows, occupied, shape = _windows(cover, half, step)
-    i, j = np.mgrid[-half:half, -half:half] + 0.5
-    inside = np.hypot(i, j) * COVER_RESOLUTION <= radius
-    # Rasters count rows southwards.
-    x, y = j[inside] * COVER_RESOLUTION, -i[inside] * COVER_RESOLUTION
-    angles = np.radians(np.arange(0, 180, CYLINDER_TURN))
-    across = y * np.cos(angles)[:, None] - x * np.sin(angles)[:, None]
-    n = 2 * half
-    bins = np.clip(np.floor(across / COVER_RESOLUTION).astype(np.int64) + half, 0, n - 1)
-    bins += n * np.arange(len(angles))[:, None]
-    flat = (np.ones(bins.size), (bins.ravel(), np.tile(np.arange(len(x)), len(angles))))
-    sums = sparse.csr_array(flat, shape=(n * len(angles), len(x)))
-    size = np.maximum(sums.sum(axis=1).reshape(len(angles), n), 1.0)
-
-    def waves(batch: NDArray[np.int64]) -> Values:
-        k = np.arange(len(batch))
-        histogram = (sums @ windows[batch][:, inside].T).T.reshape(len(batch), len(angles), n) / size
-        histogram -= np.average(histogram, axis=2, weights=np.broadcast_to(size, histogram.shape))[:, :, None]
-        best = (histogram**2 * size).sum(axis=2).argmax(axis=1)
-        profile = histogram[k, best] * np.sqrt(size[best] / size.max())
-        power = np.abs(rfft(profile, n=2 * n, axis=1)) ** 2
-        similar = irfft(power, axis=1)[:, :n] / np.maximum(power.mean(axis=1), 1e-12)[:, None]
-        similar /= np.maximum(similar[:, :1], 1e-12)
-        low, high = (round(spacing / COVER_RESOLUTION) for spacing in band)
-        lag = low + similar[:, low : high + 1].argmax(axis=1)
-        around = [similar[k, lag + d] for d in (-1, 0, 1)]
-        period = [lag[m] + _vertex(*(v[m] for v in around)) for m in k]
-        return np.stack([angles[best], np.array(period) * COVER_RESOLUTION, np.clip(around[1], 0, 1)])
-
-    batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    return _peaks([waves(batch) for batch in batches], occupied, shape)
-
-
-def _windows(cover: Values, half: int, step: float) -> tuple[Values, NDArray[np.int64], tuple[int, int]]:
-    """Windows (nodes, 2 half, 2 half) on a grid of nodes (my, mx) from the raster's corner, which are near canopy."""
-    size = 2 * half
-    stride = max(1, round(step / COVER_RESOLUTION))
-    # Windows reach over the edge by half their width; what lies there is no canopy.
-    my, mx = (n // stride + 2 for n in cover.shape)
-    padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)
-    padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover[
-        : padded.shape[0] - half, : padded.shape[1] - half
-    ]
-    windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
-    reach = 2 * round((NEAR + step) / COVER_RESOLUTION) + 1
-    canopy = np.pad(maximum_filter(cover, reach) > LEAST_COVER, [(0, 2 * stride)], mode="edge")
-    return windows, np.flatnonzero(canopy[::stride, ::stride][:my, :mx]), (my, mx)
-
-
-def _peaks(waves: Sequence[Values], occupied: NDArray[np.int64], shape: tuple[int, int]) -> _Peaks:
-    out = np.zeros((3, shape[0] * shape[1]))
-    out[:2] = np.nan
-    if waves:
-        out[:, occupied] = np.concatenate(waves, axis=1)
-    return _Peaks(*out.reshape(3, *shape))
-
-
-def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
-    """Direction (rad), spacing (m) and strength (0–1) of windows (k, size, size), as (3, k)."""
-    size = windows.shape[-1]
-    wide = PADDING * size
-    mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
-    rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2)
-    spectrum = fft(rows, n=wide, axis=1)
-    y, x, strength = _strongest(spectrum, COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING)
-    # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
-    direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
-    return np.stack([direction, 1 / np.hypot(x, y), strength])
-
-
-@compiled
-def _strongest(
-    spectrum: NDArray[np.complex64], cell: float, shortest: float, longest: float, harmonics: int, reach: int
-) -> tuple[Values, Values, Values]:
-    """Frequency of the strongest wave (y and x, cycles a metre) of spectra (k, n, n/2 + 1), and its strength 0–1.
-
-    The strength is the share of the power beyond long waves that the main lobes (``reach`` bins wide) about the
-    wave and its harmonics hold.
-    """
-    windows, n, _ = spectrum.shape
-    half = n // 2
-    unit = n * cell
-    lowest, highest, long = (unit / longest) ** 2, (unit / shortest) ** 2, (unit / longest / 1.5) ** 2
-    y, x, strength = np.empty(windows), np.empty(windows), np.empty(windows)
-    for k in range(windows):
-        power = spectrum[k].real ** 2 + spectrum[k].imag ** 2
-        total, most = 0.0, -1.0
-        best_i, best_j = 0, 0
-        for row in range(n):
-            i = row if row < half else row - n
-            for j in range(half + 1):
-                square = i * i + j * j
-                if square < long:
-                    continue
-                # A real signal's spectrum is symmetric: the half that is kept holds the column j = 0 whole.
-                total += power[row, j] if j else 0.5 * power[row, j]
-                if lowest <= square <= highest and power[row, j] > most:
-                    most, best_i, best_j = power[row, j], i, j
-        if most < 0:  # no bin lies in so narrow a band
-            y[k], x[k], strength[k] = 0.0, 1 / longest, 0.0
-            continue
-        held = 0.0
-        for harmonic in range(1, harmonics + 1):
-            held += _lobe(power, harmonic * best_i, harmonic * best_j, reach)
-        strength[k] = min(held / max(total, 1e-12), 1.0)
-        here = np.log(power[best_i, best_j] + 1e-12)
-        left = power[best_i, best_j - 1] if best_j else power[-best_i, 1]
-        right = power[best_i, min(best_j + 1, half)]
-        x[k] = (best_j + _vertex(np.log(left + 1e-12), here, np.log(right + 1e-12))) / unit
-        north, south = np.log(power[best_i - 1, best_j] + 1e-12), np.log(power[best_i + 1, best_j] + 1e-12)
-        y[k] = (best_i + _vertex(north, here, south)) / unit
-    return y, x, strength
-
-
-@compiled
-def _lobe(power: Values, middle_i: int, middle_j: int, reach: int) -> float:
-    """Power about one bin of a spectrum (n, n/2 + 1); none beyond the spectrum's edge."""
-    half = power.shape[1] - 1
-    held = 0.0
-    for a in range(-reach, reach + 1):
-        for b in range(-reach, reach + 1):
-            i, j = middle_i + a, middle_j + b
-            if j < 0:
-                i, j = -i, -j
-            if -half <= i < half and j <= half:
-                held += power[i, j]
-    return held
-
-
-@compiled
-def _vertex(left: float, middle: float, right: float) -> float:
-    """Offset in (-0.5, 0.5) of the vertex of the parabola through three neighbours."""
-    bend = left - 2 * middle + right
-    return float(min(max(0.5 * (left - right) / bend, -0.5), 0.5)) if abs(bend) > 1e-9 else 0.0
-
-
-def _axial_median(peaks: _Peaks) -> _Peaks:
+def _axial_median(peaks: Peaks) -> Peaks:
     """Replace each window's wave by the one of its 3 x 3 neighbours that differs least from all of them."""
     my, mx = peaks.direction.shape
     wave = np.where(np.isfinite(peaks.direction), np.exp(2j * np.nan_to_num(peaks.direction)), 0)
@@ -275,10 +98,10 @@ def _axial_median(peaks: _Peaks) -> _Peaks:
     direction = np.mod(np.angle(np.take_along_axis(waves, best, 0)[0]) / 2, np.pi)
     spacing = np.take_along_axis(spacings, best, 0)[0]
     empty = peaks.strength == 0
-    return _Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
+    return Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
 
 
-def _resample(peaks: _Peaks, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:
+def _resample(peaks: Peaks, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:
     """Bring the waves of the windows to a raster, weighted by their strength."""
     x, y = grid.centres()
     i, j = np.meshgrid((base.north - y) / step, (x - base.west) / step, indexing="ij")

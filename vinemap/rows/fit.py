@@ -14,38 +14,31 @@ import geopandas as gpd
 import numpy as np
 import shapely
 from scipy import sparse
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import spsolve
 
-from vinemap.compute.threads import compiled, in_threads, stretches
+from vinemap.cloud.frame import points_of_rows
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads, stretches
+from vinemap.geo.curve import between, normals, resample, way_along
 from vinemap.geo.raster import Raster, sample
-from vinemap.rows.frame import (
-    between,
-    centre_line,
-    half_width,
-    normals,
-    points_of_rows,
-    resample,
-    runs_above,
-    way_along,
-)
+from vinemap.rows.centre_line import centre_line, half_width
+from vinemap.rows.ends import Fit, find_ends
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from vinemap.cloud.frame import Taken
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.raster import Grid
-    from vinemap.rows.frame import Taken
 
     Values = NDArray[np.floating]
 
 CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
-AROUND = 0.3
-"""Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
 COURSE = 20.0
@@ -56,20 +49,10 @@ RAMP = 0.1
 """Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
 REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
-SHORTEST = 0.35
-"""Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
 LEAST_CONTRAST = 0.6
 """Contrast of a lone row's canopy to what lies beside it, below which it is a bush or a hedge."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
-
-
-class _Fit(NamedTuple):
-    """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast."""
-
-    curve: Values
-    runs: Values
-    contrast: float
 
 
 class _Share(NamedTuple):
@@ -125,7 +108,7 @@ def fit_rows(
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
-    fits: dict[int, _Fit | None] = {}
+    fits: dict[int, Fit | None] = {}
     for group, shares in _deal(cloud, cover, curves, half, low, high):
         found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
         fits |= dict(zip(group.tolist(), found, strict=True))
@@ -147,14 +130,14 @@ def fit_rows(
     )
 
 
-def _fit(share: _Share, *, smoothing: float, end_share: float) -> _Fit | None:
+def _fit(share: _Share, *, smoothing: float, end_share: float) -> Fit | None:
     """Centre line of a row about its course, between the ends of its canopy."""
     still = np.zeros(len(share.curve))
     image, offsets = _straighten(share, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
     shift = centre_line(image, offsets, reach=0.75 * share.half, cutoff=cutoff)
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
-    return _ends(centred, _straighten(share, shift)[0], end_share)
+    return find_ends(centred, _straighten(share, shift)[0], end_share)
 
 
 def _smooth_course(course: Values) -> Values:
@@ -255,33 +238,6 @@ def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int
                     everything[i + a, j + b] += part
                     leaves[i + a, j + b] += part * canopy[p]
     return leaves, everything
-
-
-def _ends(curve: Values, image: Values, end_share: float) -> _Fit | None:
-    """Cut a curve to where its canopy begins and ends; None where there is none."""
-    profile = image.sum(axis=1) * CELL
-    present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
-    if len(present) == 0:
-        return None
-    typical = float(np.median(present))
-    # The last vine may be a weak one: what counts is the cover thereabouts, where there is canopy at all.
-    living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
-    near, weight = (gaussian_filter1d(v, AROUND / CELL, mode="constant") for v in (profile * living, living))
-    profile *= typical / ((near + 0.1 * typical) / (weight + 0.1))
-    edge = end_share * typical
-    # Thin canopies have holes: what a weaker trace joins is one run, from its first to its last full edge.
-    weak = runs_above(profile, 0.5 * edge)
-    full = runs_above(profile, edge)
-    runs = [(f[0, 0], f[-1, 1]) for a, b in weak if len(f := full[(full[:, 0] >= a) & (full[:, 1] <= b)])]
-    metres = np.interp(np.reshape(runs, (-1, 2)), np.arange(len(curve)), way_along(curve))
-    metres = metres[np.diff(metres, axis=1)[:, 0] >= SHORTEST]
-    if len(metres) == 0:
-        return None
-    canopy = image[profile > edge]
-    aside = max(1, canopy.shape[1] // 8)
-    beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
-    contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
-    return _Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
 
 
 def _line(curve: Values, dtm: Raster) -> shapely.LineString:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
-from vinemap.compute.threads import compiled, in_threads
+from vinemap.compute.compiled import compiled
+from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import Raster, block_sum, cell_of, grid_over
 
 if TYPE_CHECKING:

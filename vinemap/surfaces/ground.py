@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_opening, correlate1d, maximum_filter
+from scipy.ndimage import binary_opening
 from scipy.special import ndtr, ndtri
 
-from vinemap.cloud.bins import quantiles_in
-from vinemap.compute.threads import in_threads
 from vinemap.errors import InputError
-from vinemap.geo.raster import Grid, Raster, above, block_sum, cell_of, coarser, grid_over, sample, window
+from vinemap.geo.raster import Grid, Raster, cell_of, coarser, grid_over, sample
+from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
+from vinemap.surfaces.statistics import cells_a_block, order_statistics
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,20 +28,12 @@ if TYPE_CHECKING:
 
 GROUND = 2
 """ASPRS class of ground."""
-COARSE = 1.0
-"""Cell size in metres of the first, coarse surface."""
 EVEN = 0.02
 """Metres that terrain may rise from cell to cell above what a fit was made along."""
 WEEDS = 0.3
 """Metres between a cell's low height and its median up to which its vegetation is weeds, and not a canopy."""
 FEW = 6.0
 """Points whose heights tell nothing of weeds."""
-SPIKE = 0.3
-"""Metres by which a cell of the canopy height model may stand out."""
-NARROWEST = 1.2
-"""Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
-RIDGE = 0.02
-"""Weight that holds a local plane to the coarser surface where cells are few."""
 
 
 class _Cells(NamedTuple):
@@ -87,14 +79,14 @@ def terrain_model(
     """
     if engine == "pdal":
         return classified_terrain(cloud, resolution=resolution)
-    blocks = _blocks(resolution)
+    blocks = cells_a_block(resolution)
     grid = grid_over(*cloud.extent, resolution=resolution, multiple=blocks)
     wide = coarser(grid, resolution=blocks * resolution)
     x, y = grid.centres()
     coarse = Raster(_coarse_surface(cloud, grid, blocks), wide, cloud.crs)
     surface = Raster(sample(coarse, np.stack(np.meshgrid(x, y), axis=-1)), grid, cloud.crs)
     for _ in range(2):
-        n, found = _order_statistics(cloud, surface, grid, (quantile, 0.5, 0.9))
+        n, found = order_statistics(cloud, surface, grid, (quantile, 0.5, 0.9))
         cells = _Cells(n, *found)
         fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
         surface = Raster(surface.values + fitted, grid, cloud.crs)
@@ -102,16 +94,6 @@ def terrain_model(
         if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
             break
     return surface
-
-
-def _blocks(resolution: float) -> int:
-    """Cells a side of the blocks of the coarse surface."""
-    return max(1, round(COARSE / resolution))
-
-
-def block_side(resolution: float) -> float:
-    """Side in metres of the terrain model's blocks of cells, which a cloud in tiles must not divide."""
-    return _blocks(resolution) * resolution
 
 
 def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
@@ -125,7 +107,7 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
         If no point is classified as ground.
     """
     low, high = cloud.extent
-    grid = grid_over(low, high, resolution=resolution, multiple=_blocks(resolution))
+    grid = grid_over(low, high, resolution=resolution, multiple=cells_a_block(resolution))
     reference = float(np.round((low[2] + high[2]) / 2))
     n, total = np.zeros((2, grid.ny * grid.nx))
     for part in cloud.parts():
@@ -139,9 +121,9 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
     held = n.reshape(grid.shape) > 0
     level = (total / np.maximum(n, 1)).reshape(grid.shape)
     plain = weight = np.minimum(n, 15.0).reshape(grid.shape)
-    surface = _trend(level, held)
+    surface = quadratic_trend(level, held)
     for reach in (1.5, 1.5, 0.6, 0.3):
-        surface = surface + _multiscale(level - surface, weight, reach / resolution)
+        surface = surface + multiscale_fit(level - surface, weight, reach / resolution)
         off = np.abs(level - surface)
         weight = plain / (1 + (off / (0.05 + 2 * np.median(off[held]))) ** 2)
     return Raster(surface + reference, grid, cloud.crs)
@@ -160,22 +142,8 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
         terrain = above < slack * tolerance
         terrain |= thin & (above < terrace_height)
         terrain &= above > -3 * slack * tolerance
-        surface = _multiscale(level, weight * terrain, reach / resolution)
-    return _multiscale(level, weight * terrain, 0.3 / resolution)
-
-
-def canopy_height_model(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
-    """Canopy height model: the 98% height in metres of each cell's points, NaN where there is none.
-
-    A cell stands no higher than the highest of its eight neighbours by more than ``SPIKE``, so that a point in the
-    air doesn't make a tower. The cloud has its heights, and the resolution is that of its terrain model.
-    """
-    grid = grid_over(*cloud.extent, resolution=resolution, multiple=_blocks(resolution))
-    n, found = _order_statistics(cloud, None, grid, (0.98,))
-    height = np.maximum(found[0], 0)
-    around = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
-    height = np.minimum(height, maximum_filter(height, footprint=around) + SPIKE)
-    return Raster(np.where(n > 0, height, np.nan), grid, cloud.crs)
+        surface = multiscale_fit(level, weight * terrain, reach / resolution)
+    return multiscale_fit(level, weight * terrain, 0.3 / resolution)
 
 
 def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Values:
@@ -183,53 +151,22 @@ def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Values:
     low, high = cloud.extent
     reference = float(np.round((low[2] + high[2]) / 2))
     level = Raster(np.full((1, 1), reference), grid, cloud.crs)
-    n, (lowest,) = _order_statistics(cloud, level, grid, (0.05,), blocks=blocks)
+    n, (lowest,) = order_statistics(cloud, level, grid, (0.05,), blocks=blocks)
     step = blocks * grid.resolution
     # Local planes are held to zero where cells are few, so the hillside must be gone first: an upper edge that stood
     # out above them would be taken for a house.
     held = n > 0
-    trend = _trend(lowest, held)
+    trend = quadratic_trend(lowest, held)
     bare = lowest - trend
     weight = held.astype(float)
     surface = np.zeros(n.shape)
     for sigma in (8.0, 8.0, 5.0, 5.0, 5.0, 4.0, 4.0, 4.0):
-        surface = _multiscale(bare, weight, sigma / step)
+        surface = multiscale_fit(bare, weight, sigma / step)
         above_it = np.where(held, bare - surface, 0.0)
         scale = 0.1 + 1.5 * float(np.median(np.abs(above_it[held])))
         asymmetric = np.where(above_it > 0, above_it / scale, above_it / (5 * scale))
         weight = np.where(held, 1 / (1 + asymmetric**2) ** 2, 0.0)
     return surface + trend + reference
-
-
-def _trend(level: Values, held: NDArray[np.bool_]) -> Values:
-    """Quadratic surface (ny, nx) through the levels of those cells that hold points, fitted robustly."""
-    ny, nx = level.shape
-    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    design, low = terms[held], level[held]
-    weight = np.ones(len(low))
-    coefficients = np.zeros(6)
-    for _ in range(10):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(design * root[:, None], low * root, rcond=None)[0]
-        off = np.abs(low - design @ coefficients)
-        weight = 1 / (1 + (off / (0.1 + 2 * np.median(off))) ** 2)
-    out: Values = terms @ coefficients
-    return out
-
-
-def _order_statistics(
-    cloud: Cloud, surface: Raster | None, grid: Grid, quantiles: tuple[float, ...], *, blocks: int = 1
-) -> tuple[Values, Values]:
-    """Counts and quantiles of the heights above a surface, or else above ground, in blocks of a grid's cells."""
-    shape = [side // blocks for side in grid.shape]
-    n, found = np.zeros(shape), np.zeros((len(quantiles), *shape))
-    for part in cloud.parts():
-        around, (rows, columns) = window(grid, *part.extent, multiple=_blocks(grid.resolution))
-        heights = part.heights if surface is None else above(surface, part.xyz)
-        here = slice(rows.start // blocks, rows.stop // blocks), slice(columns.start // blocks, columns.stop // blocks)
-        n[here], found[:, *here] = quantiles_in(part.bins(around), heights, quantiles, blocks=blocks)
-    return n, found
 
 
 def _depth(n: Values, quantile: float) -> Values:
@@ -271,52 +208,3 @@ def _noise(cells: _Cells, quantile: float) -> float:
     dense = cells.n >= max(5.0, float(np.quantile(cells.n[cells.n > 0], 0.5)))
     half = (cells.middle - cells.low)[dense] / -_depth(cells.n[dense], quantile)
     return float(np.clip(np.quantile(half, 0.33), 0.005, 0.1)) if half.size else 0.03
-
-
-def _multiscale(level: Values, weight: Values, sigma: float) -> Values:
-    """Local planes of width sigma (cells), held to ever wider ones where cells lack."""
-    surface = np.zeros_like(level)
-    for scale in (9.0, 3.0, 1.0):
-        surface = surface + _decimated_fit(level - surface, weight, sigma * scale)
-    return surface
-
-
-def _decimated_fit(level: Values, weight: Values, sigma: float) -> Values:
-    """:func:`_plane_fit` for wide planes on blocks of cells, brought back to the cells."""
-    k = int(sigma / NARROWEST)
-    if k < 2:
-        return _plane_fit(level, weight, sigma)
-    mean_weight = block_sum(weight, k) / k**2
-    mean_level = block_sum(weight * level, k) / k**2 / np.maximum(mean_weight, 1e-9)
-    wide = _plane_fit(mean_level, mean_weight, sigma / k)
-    i, j = ((np.arange(n) + 0.5) / k - 0.5 for n in level.shape)
-    for axis, at in ((0, i), (1, j)):
-        low = np.clip(np.floor(at).astype(int), 0, max(wide.shape[axis] - 2, 0))
-        part = (at - low)[:, None] if axis == 0 else (at - low)[None, :]
-        high = np.minimum(low + 1, wide.shape[axis] - 1)
-        wide = np.take(wide, low, axis) * (1 - part) + np.take(wide, high, axis) * part
-    return wide
-
-
-def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
-    """Value at each cell of the weighted local plane through levels (ny, nx): first-order local regression."""
-    radius = int(np.ceil(2.5 * sigma))
-    t = np.arange(-radius, radius + 1) / sigma
-    bell = np.exp(-0.5 * t**2)
-    bell /= bell.sum()
-    kernels = bell, bell * t, bell * t**2
-
-    values = weight * level
-    wanted = [(weight, 0, 0), (weight, 1, 0), (weight, 0, 1), (weight, 2, 0), (weight, 1, 1), (weight, 0, 2)]
-    wanted += [(values, 0, 0), (values, 1, 0), (values, 0, 1)]
-
-    def moment(of: tuple[Values, int, int]) -> Values:
-        down: Values = correlate1d(of[0], kernels[of[1]], axis=0, mode="constant")
-        out: Values = correlate1d(down, kernels[of[2]], axis=1, mode="constant")
-        return out
-
-    w, wi, wj, wii, wij, wjj, z, zi, zj = in_threads(moment, wanted)
-    w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
-    # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
-    a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj
-    return (a * z + b * zi + c * zj) / (a * w + b * wi + c * wj)

@@ -207,8 +207,8 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
     import CSF
     import shapely
 
+    from vinemap.geo.boundaries import read_boundary
     from vinemap.geo.raster import sample
-    from vinemap.product.geopackage import read_boundary
 
     xyz, found = mapped(cloud, boundary)
 
@@ -264,7 +264,8 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     import geopandas as gpd
     from sklearn.cluster import DBSCAN
 
-    from vinemap.evaluate.rows import evaluate_rows, read_lines
+    from vinemap.evaluate.rows import evaluate_rows
+    from vinemap.geo.lines import read_lines
     from vinemap.geo.raster import sample
 
     xyz, found = mapped(cloud, boundary)
@@ -323,7 +324,8 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
     """OpenCV's approxPolyN beside our c-gons, around the same hulls: the foliage's outlines in sections."""
     import cv2
 
-    from vinemap.canopy.cgon import enclose, hull
+    from vinemap.canopy.cgon import enclose
+    from vinemap.canopy.hull import hull
     from vinemap.config.settings import PolygonOptions, Settings
     from vinemap.parcel import model_canopies
 
@@ -353,8 +355,8 @@ def mapped(cloud: str, boundary: str) -> tuple[Array, RowMap]:
     """Points (n, 3) of a parcel, and its rows as they come."""
     from vinemap.cloud.las import read_cloud
     from vinemap.config.settings import Settings
+    from vinemap.geo.boundaries import read_boundary
     from vinemap.parcel import map_rows
-    from vinemap.product.geopackage import read_boundary
 
     points = read_cloud(Path(cloud), boundary=read_boundary(Path(boundary)))
     return np.concatenate([part.xyz for part in points.parts()]), map_rows(points, Settings())

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from vinemap.measure.odometry.trials import ByMethod, Drift, Losses, Size
-    from vinemap.odometry.step import Method
+    from vinemap.odometry.refinement import Method
 
     Lines = list[list[str]]
 

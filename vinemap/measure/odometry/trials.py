@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.config.camera import Camera
-    from vinemap.odometry.step import Method, Strategy
+    from vinemap.odometry.refinement import Method
+    from vinemap.odometry.step import Strategy
     from vinemap.simulate.camera import Image
     from vinemap.simulate.steps import Step
 

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
+from vinemap.cloud.frame import points_of_rows
 from vinemap.cloud.points import PointCloud
-from vinemap.rows.frame import between, extend, points_of_rows, resample, runs_above, way_along, whittaker
+from vinemap.geo.curve import between, extend, resample, way_along
+from vinemap.rows.centre_line import runs_above, whittaker
 
 
 def row_coordinates(xyz, curves, reach):

@@ -1,0 +1,45 @@
+"""Configurations of a robot: its camera, and drives whose tracks are made in one job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from vinemap.config.camera import Camera
+from vinemap.config.settings import OdometryOptions, Options
+from vinemap.config.yaml_files import checked_by, read_yaml, validated
+from vinemap.geo.crs import Start, check_start
+
+if TYPE_CHECKING:
+    from vinemap.config.surveys import Name
+
+MapStart = Annotated[Start, checked_by(check_start)]
+
+
+class DriveConfig(Options):
+    """One drive of a robot."""
+
+    frames: list[Path] = Field(min_length=1, description="images, folders of images, or videos, in order")
+    start: MapStart | None = Field(None, description="latitude, longitude, heading clockwise from north (degrees)")
+
+
+class DrivesConfig(Options):
+    """Drives of a robot whose tracks are made in one job."""
+
+    camera: Path = Field(description="file of the robot's camera")
+    rows: Path | None = Field(None, description="vine rows, for the distance to the nearest one")
+    out: Path = Field(Path("data/tracks"), description="folder of the tracks")
+    odometry: OdometryOptions = OdometryOptions()
+    drives: dict[Name, DriveConfig] = Field(min_length=1, description="the drives by their names")
+
+
+def load_drives(path: Path) -> DrivesConfig:
+    """Read the YAML file of a robot's drives; ConfigError names the key, its value and what it may be."""
+    return validated(DrivesConfig, read_yaml(path), path)
+
+
+def load_camera(path: Path) -> Camera:
+    """Read the YAML file of a robot's camera; ConfigError names the key, its value and what it may be."""
+    return validated(Camera, read_yaml(path), path)

@@ -1,0 +1,44 @@
+"""Whether a step between two frames is to be believed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinemap.odometry.correlation import Place, warp
+from vinemap.odometry.views import View, coarseness
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LEAST_OVERLAP = 0.1
+"""Share of a frame that the next one must show too."""
+LEAST_SHARPNESS = 0.5
+"""Detail of the blurrier frame as a share of the other's."""
+LEAST_SCORE, LEAST_AGREEMENT, MOST_RIVAL = 0.5, 0.35, 0.7
+"""Of a step that is believed: correlation of the template, that of all that both frames show, and the share of the
+latter that the next best place may reach."""
+
+
+def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> tuple[float, float]:
+    """Correlation of all that two coarse frames both show, and its share of a frame.
+
+    It is the quadrant correlation, as Pearson's for normal values, which a few dark or bright spots that move with the
+    camera can't decide: N. Blomqvist, On a measure of dependence between two random variables, 1950.
+    """
+    import cv2
+
+    a, b = view.detail, next_view.detail
+    n = coarseness(view.image)
+    source, target = ((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:]))
+    matrix = warp(place.angle, source, target)
+    size, flags = b.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    moved = cv2.warpAffine(a, matrix, size, flags=flags)
+    shown = cv2.warpAffine(np.ones_like(a), matrix, size, flags=flags) > 0.999
+    overlap = float(shown.mean())
+    if overlap < LEAST_OVERLAP:
+        return 0.0, overlap
+    x, y = moved[shown], b[shown]
+    quadrants = np.mean(np.sign(x - np.median(x)) * np.sign(y - np.median(y)))
+    return float(np.sin(np.pi / 2 * quadrants)), overlap

@@ -1,0 +1,145 @@
+"""What the layers of a product's GeoPackage hold: columns in order, their types, and the tables that fill them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import geopandas as gpd
+import numpy as np
+import shapely
+
+from vinemap.geo.crs import project
+from vinemap.rows.blocks import outline_blocks
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+    from vinemap.cloud.tiles import Cloud
+
+    Boundary = tuple[shapely.Geometry, CRS]
+
+TEXT, WHOLE, REAL, TIME = "str", "int64", "float64", "datetime64[ms, UTC]"
+_END = ("x", "y", "z"), ("lat", "lon", "alt")
+_ROW = {"row_id": WHOLE, "label": TEXT}
+
+
+class Layer(NamedTuple):
+    """Contract of a layer: OGR geometry type, columns in order with their dtype, what it holds."""
+
+    geometry: str
+    columns: dict[str, str]
+    description: str
+
+
+LAYERS: dict[str, Layer] = {
+    "rows": Layer(
+        "LineString Z",
+        _ROW
+        | dict.fromkeys(("length_m", "orientation_deg", "elevation_m", "elevation_diff_m"), REAL)
+        | {"n_key_points": WHOLE}
+        | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
+        | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL)
+        | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT}
+        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha"), REAL),
+        "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
+    ),
+    "row_ends": Layer("Point Z", _ROW | {"end": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
+    "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
+    "sections": Layer(
+        "LineString Z",
+        _ROW
+        | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL)
+        | {"n_points": WHOLE}
+        | dict.fromkeys(("trv_m3_ha", "lwa_m2_ha", "good", "under", "over", "reduction", "quality"), REAL),
+        "Sections across the canopy",
+    ),
+    "gaps": Layer(
+        "LineString Z",
+        _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE},
+        "Stretches of rows without canopy",
+    ),
+    "parcel": Layer(
+        "MultiPolygon",
+        {"parcel": TEXT, "n_rows": WHOLE}
+        | dict.fromkeys(("rows_length_m", "area_m2", "spacing_m", "orientation_deg", "gap_m"), REAL)
+        | {"n_missing": WHOLE, "vine_spacing_m": REAL, "vertical_datum": TEXT},
+        "The parcel, or its blocks of one direction and spacing where it was given no boundary",
+    ),
+}
+
+
+TRACK_LAYERS: dict[str, Layer] = {
+    "track": Layer(
+        "LineString",
+        {"stretch": WHOLE, "n_poses": WHOLE} | dict.fromkeys(("length_m", "seconds", "score"), REAL),
+        "The robot's track: a line for each stretch within which every pose was measured",
+    ),
+    "poses": Layer(
+        "Point",
+        {"pose": WHOLE, "frame": TEXT, "time": TIME, "seconds": REAL}
+        | dict.fromkeys(("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap"), REAL)
+        | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
+        | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
+        "Poses of the robot, one a frame",
+    ),
+}
+"""What the GeoPackage of a robot's track holds."""
+
+
+def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
+    """Bring a table to a layer's columns, in order and with their types.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing.
+    """
+    columns = (LAYERS | TRACK_LAYERS)[layer].columns
+    missing = sorted(set(columns) - set(frame.columns))
+    if missing:
+        raise ValueError(f"layer {layer} lacks {', '.join(missing)}")
+    return frame[[*columns, "geometry"]].astype(columns)
+
+
+def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Give what belongs to rows, by ``row_id``, their ``label``."""
+    return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
+
+
+def parcel_layer(parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: Cloud) -> gpd.GeoDataFrame:
+    """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
+    blocks = outline_blocks(rows)
+    if boundary or len(blocks) == 0:
+        polygon = project(*boundary, points.crs) if boundary else _extent(points)
+        totals = [_totals(parcel, rows, polygon, points)]
+        polygons = [polygon]
+    else:
+        polygons = list(blocks.geometry)
+        names = [parcel] if len(blocks) == 1 else [f"{parcel} {block}" for block in blocks["block"]]
+        totals = [
+            _totals(name, rows[rows["block"] == block], polygon, points)
+            for name, block, polygon in zip(names, blocks["block"], polygons, strict=True)
+        ]
+    parts = [[p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"] for polygon in polygons]
+    return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
+
+
+def _extent(points: Cloud) -> shapely.Geometry:
+    polygon: shapely.Geometry = shapely.box(*points.extent[0][:2], *points.extent[1][:2])
+    return polygon
+
+
+def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points: Cloud) -> dict[str, Any]:
+    angle = np.exp(2j * np.radians(rows["orientation_deg"])) @ rows["length_m"]
+    return {
+        "parcel": name,
+        "n_rows": len(rows),
+        "rows_length_m": rows["length_m"].sum(),
+        "area_m2": float(shapely.area(polygon)),
+        "spacing_m": rows["spacing_m"].median(),
+        "orientation_deg": np.degrees(np.angle(angle)) / 2 if len(rows) else np.nan,
+        "gap_m": rows["gap_m"].sum(),
+        "n_missing": rows["n_missing"].sum(),
+        "vine_spacing_m": rows["vine_spacing_m"].median(),
+        "vertical_datum": points.vertical or "",
+    }

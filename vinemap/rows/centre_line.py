@@ -1,0 +1,143 @@
+"""The centre line of a row's canopy in a straightened image of it, and the smoothing that makes it one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from vinemap.compute.compiled import compiled
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Values = NDArray[np.floating]
+
+TREND = 5.0
+"""Cutoff of a row's trend, in cutoffs of its detail."""
+SLOPE = 1.0
+"""Cutoff of a detail's slopes, in cutoffs of its bends."""
+
+
+def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:
+    """Offset in metres (n,) of the canopy's centre from a curve at each station of a straightened row.
+
+    Centroids above a background, within ``reach`` metres of the smoothed centre so far, smoothed robustly.
+
+    Parameters
+    ----------
+    image : (n, m) array
+        Canopy cover at n stations and m cells across.
+    offsets : (m,) array
+        The cells' metres to the left of the curve.
+    reach : float
+        Metres to both sides.
+    cutoff : float
+        Wavelength in stations below which bends are noise.
+    """
+    smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
+    strength = np.quantile(smooth.max(axis=1), 0.7)
+    excess = np.maximum(smooth - 0.25 * strength, 0)
+    centre: Values = np.zeros(len(image))
+    for _ in range(4):
+        amount, moment = _centroids(excess, offsets, centre, reach)
+        # Stations of a stray leaf or two tell nothing of the row's middle.
+        typical = float(np.quantile(amount, 0.7))
+        weight = amount * np.clip(2 * amount / max(typical, 1e-9) - 0.5, 0, 1)
+        measured = moment / np.maximum(amount, 1e-9)
+        robust = np.ones(len(image))
+        for _ in range(3):
+            trusted = weight * robust
+            trend = whittaker(measured, trusted, cutoff=TREND * cutoff)
+            # Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
+            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, slope=SLOPE * cutoff, ridge=0.3)
+            residual = np.abs(measured - centre)
+            scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
+            robust = 1 / (1 + (residual / (2 * scale)) ** 2)
+    return centre
+
+
+@compiled
+def _centroids(excess: Values, offsets: Values, centre: Values, reach: float) -> tuple[Values, Values]:
+    """Sums (n,) of canopy (n, m) within reach of a centre (n,), plain and times its offset (m,)."""
+    amount, moment = np.zeros(len(excess)), np.zeros(len(excess))
+    for i in range(len(excess)):
+        for j in range(len(offsets)):
+            # A soft edge, so that a cell more or less doesn't move the centroid.
+            soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
+            amount[i] += excess[i, j] * soft
+            moment[i] += excess[i, j] * soft * offsets[j]
+    return amount, moment
+
+
+def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:
+    """Smooth values (n,) by penalised least squares on their second and first differences (Eilers 2003).
+
+    ``cutoff`` is the wavelength, in samples, that is halved where weights are 1; where they are 0 the smoothest
+    course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
+    wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
+    """
+    if len(values) < 3:
+        return values
+    bands = _penalties(
+        np.asarray(weights, dtype=float), (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2, max(ridge, 1e-9)
+    )
+    return _solve(bands, np.asarray(weights * values, dtype=float))
+
+
+@compiled
+def _penalties(weights: Values, second: float, first: float, ridge: float) -> Values:
+    """Diagonal and both bands (n, 3) of what minimises Σ w (x − v)² + penalties on Δ²x, Δx, and x in gaps."""
+    n = len(weights)
+    level = weights.mean()
+    if level == 0:
+        level = 1.0
+    held = np.flatnonzero(weights >= 0.1 * level)
+    gap_first, gap_last = (held[0], held[-1]) if len(held) else (n, -1)
+    bands = np.zeros((n, 3))
+    for i in range(n):
+        left, inner, right = i > 1, 0 < i < n - 1, i < n - 2
+        in_gap = gap_first < i < gap_last and weights[i] < 0.1 * level
+        bands[i, 0] = weights[i] + level * (
+            second * (left + 4 * inner + right) + first * ((i > 0) + (i < n - 1)) + (ridge if in_gap else 1e-9)
+        )
+        bands[i, 1] = -level * (2 * second * (inner + right) + first * (i < n - 1))
+        bands[i, 2] = level * second * right
+    return bands
+
+
+@compiled
+def _solve(bands: Values, values: Values) -> Values:
+    """Solve a symmetric system (n, n) of diagonal and two bands (n, 3) by its factors L D Lᵀ."""
+    n = len(values)
+    x = values.copy()
+    for i in range(n):
+        for k in range(1, min(i, 2) + 1):
+            x[i] -= bands[i - k, k] * x[i - k]
+            bands[i, 0] -= bands[i - k, 0] * bands[i - k, k] ** 2
+        if i > 0:
+            bands[i, 1] -= bands[i - 1, 0] * bands[i - 1, 1] * bands[i - 1, 2]
+        bands[i, 1] /= bands[i, 0]
+        bands[i, 2] /= bands[i, 0]
+    for i in range(n - 1, -1, -1):
+        x[i] /= bands[i, 0]
+        for k in range(1, min(n - 1 - i, 2) + 1):
+            x[i] -= bands[i, k] * x[i + k]
+    return x
+
+
+def runs_above(profile: Values, level: float) -> Values:
+    """Stretches (k, 2), in samples, on which a profile (n,) lies above a level, interpolated where it crosses."""
+    padded = np.concatenate([[0.0], profile, [0.0]])
+    above = padded > level
+    rise, fall = np.flatnonzero(above[1:] & ~above[:-1]), np.flatnonzero(~above[1:] & above[:-1])
+    start = rise - 1 + (level - padded[rise]) / (padded[rise + 1] - padded[rise])
+    end = fall - 1 + (padded[fall] - level) / (padded[fall] - padded[fall + 1])
+    out: Values = np.clip(np.column_stack([start, end]), 0, len(profile) - 1)
+    return out
+
+
+def half_width(spacing: Values | float) -> Values:
+    """Metres to both sides of a row, of a spacing in metres, in which its canopy is looked for."""
+    return np.minimum(0.8, 0.42 * np.asarray(spacing))
