@@ -18,7 +18,7 @@ from prefect.states import Completed, Failed
 from flows.serving import serve
 from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap import paths
-from vinemap.cli.main import plain_errors
+from vinemap.cli.terminal import plain_errors
 from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.jobs.estate import Arrival, arrivals

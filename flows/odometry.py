@@ -15,7 +15,7 @@ from prefect.states import Completed, Failed
 
 from flows.parcel import as_tasks
 from vinemap import paths
-from vinemap.cli.main import frame_progress, plain_errors
+from vinemap.cli.terminal import frame_progress, plain_errors
 from vinemap.config.drives import DrivesConfig, load_camera, load_drives
 from vinemap.errors import ConfigError, OutputError, VinemapError, own_fault
 from vinemap.odometry.drive import map_drive

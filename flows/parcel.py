@@ -14,7 +14,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from vinemap import paths
-from vinemap.cli.main import plain_errors, progress
+from vinemap.cli.terminal import plain_errors, progress
 from vinemap.cloud.pdal import check_engine
 from vinemap.config.surveys import SurveyConfig, choose_parcel, load_survey
 from vinemap.errors import ConfigError, InputError

@@ -17,7 +17,7 @@ from prefect.states import Completed, Failed
 
 from flows.parcel import ensure_cloud
 from vinemap import paths
-from vinemap.cli.main import plain_errors
+from vinemap.cli.terminal import plain_errors
 from vinemap.config.surveys import SurveyConfig, load_estate, load_survey
 from vinemap.errors import ConfigError, VinemapError
 from vinemap.jobs.estate import arrivals

@@ -13,8 +13,10 @@ from vinemap.cloud.points import PointCloud
 from vinemap.config.surveys import survey_config
 from vinemap.geo.crs import parse_crs
 from vinemap.jobs.survey import map_survey
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Vineyard, simulate, write_survey
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import hillside
 
 SHARED = Path(__file__).parents[2] / "shared"
 

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 SERVE = """
 import json, sys
 from flows.serving import serve
-from vinemap.cli.main import plain_errors
+from vinemap.cli.terminal import plain_errors
 with plain_errors():
     serve("job.job", **json.loads(sys.argv[1]))
 """

@@ -8,7 +8,8 @@ import pytest
 from vinemap.cli.main import commands
 from vinemap.config.drives import load_camera, load_drives
 from vinemap.config.template import template
-from vinemap.product.layers import LAYERS, TRACK_LAYERS
+from vinemap.odometry.layers import TRACK_LAYERS
+from vinemap.product.layers import LAYERS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -17,8 +17,11 @@ from vinemap.evaluate.rows import evaluate_rows
 from vinemap.geo.crs import Origin, main_to_wgs84
 from vinemap.parcel import STAGES, call, map_parcel
 from vinemap.product.layers import LAYERS
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Obstacle, Vineyard, simulate, write_survey
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import hillside
 
 RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 

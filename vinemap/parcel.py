@@ -3,43 +3,37 @@
 from __future__ import annotations
 
 import json
-import platform
 import shutil
 import time
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from vinemap import __version__, paths
-from vinemap.canopy.cgon import enclose
+from vinemap import paths
 from vinemap.canopy.classification import classify_points
-from vinemap.canopy.feet import find_feet
-from vinemap.canopy.foliage import NO_CANOPY, living_canopies, separate_canopy
-from vinemap.canopy.growth import foliage_reach, grow
+from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.mesh import section_meshes
-from vinemap.canopy.numbers import Measures, measure_sections, summarise_rows, tabulate_sections
-from vinemap.canopy.peeling import peel_sections
-from vinemap.canopy.points import join
+from vinemap.canopy.model import CanopyModel, model_sections
+from vinemap.canopy.numbers import summarise_rows
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.las import read_cloud
-from vinemap.cloud.pdal import check_engine, pdal_versions, read_cloud_pdal
+from vinemap.cloud.pdal import check_engine, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
 from vinemap.cloud.tiles import Collector
 from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
-from vinemap.compute.threads import in_threads
 from vinemap.config.names import check_name
-from vinemap.errors import InputError, own_fault
+from vinemap.config.settings import Settings
+from vinemap.errors import InputError
 from vinemap.geo.crs import Origin, to_main, to_wgs84
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
-from vinemap.product.notices import notices
-from vinemap.product.pages.parcel import parcel_page
+from vinemap.product.pages.parcel import write_page
 from vinemap.product.recipe import Recipe, recipe_of
-from vinemap.product.stac import parcel_item, save
+from vinemap.product.record import run_record
+from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
 from vinemap.rows.blocks import group_blocks
 from vinemap.rows.clusters import cluster_rows
@@ -56,18 +50,16 @@ from vinemap.surfaces.ground import terrain_model
 from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     import geopandas as gpd
-    from numpy.typing import NDArray
     from pyproj import CRS
 
     from vinemap.canopy.foliage import Canopy
     from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
-    from vinemap.config.settings import Settings
     from vinemap.geo.raster import Raster, RowField
 
 T = TypeVar("T")
@@ -91,8 +83,6 @@ STAGES = (
     "Mesh",
     "Writing",
 )
-
-LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
 
 
 class Summary(NamedTuple):
@@ -145,8 +135,24 @@ def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Rast
     return cloud, dtm, chm
 
 
-def map_rows(points: Cloud, settings: Settings, *, step: Callable[..., Any] = call) -> RowMap:
-    """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2)."""
+def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[..., Any] = call) -> RowMap:
+    """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2).
+
+    Parameters
+    ----------
+    points : PointCloud or TiledCloud
+        The parcel's points.
+    settings : Settings, optional
+        Settings of the stages.
+    step : callable
+        Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
+
+    Raises
+    ------
+    InputError
+        If the cloud is too wide for one parcel.
+    """
+    settings = settings or Settings()
     options = settings.model_dump()
     cloud, dtm, chm = step("DTM", map_surfaces, points, settings)
     cover = step("Canopy cover", canopy_cover, cloud, **options["cover"])
@@ -283,9 +289,9 @@ def follow(
 
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        record = _record(recipe, points, seen, model, layers, origin)
-        record["warnings"] += _write_page(draft, record, layers, seen)
-        _write_item(draft, recipe, record, layers["parcel"], points.crs)
+        record = run_record(recipe, points, layers, seen.chm, origin=origin, n_key_points=seen.n_key_points)
+        record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
+        write_item(draft, recipe, record, layers["parcel"])
         record |= {
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
@@ -318,80 +324,15 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., A
     return points
 
 
-def _record(
-    recipe: Recipe,
-    points: Cloud,
-    seen: RowMap,
-    model: CanopyModel,
-    layers: dict[str, gpd.GeoDataFrame],
-    origin: Origin,
-) -> dict[str, Any]:
-    """What ``run.json`` tells, but for times and files."""
-    modelling = model.table[["good", "under", "over", "reduction", "quality"]].mean().round(4)
-    versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
-    return {
-        "vinemap": __version__,
-        "key": recipe.key,
-        "survey": recipe.survey,
-        "parcel": recipe.parcel,
-        "flown": recipe.flown.isoformat(),
-        "inputs": [source.record() for source in recipe.sources],
-        "settings": recipe.settings.model_dump(mode="json"),
-        "crs": points.crs.to_string(),
-        "vertical_datum": points.vertical,
-        "origin": origin._asdict(),
-        "counts": {"points": points.size, "key_points_found": seen.n_key_points}
-        | {name: len(layer) for name, layer in layers.items()},
-        "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
-        "modelling": modelling.to_dict() if len(model.table) else None,
-        "warnings": notices(layers["rows"], seen.chm, layers["parcel"], points.size),
-        "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
-    }
+def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Callable[..., Any] = call) -> CanopyModel:
+    """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3).
 
-
-def _write_item(folder: Path, recipe: Recipe, record: dict[str, Any], polygons: gpd.GeoDataFrame, crs: CRS) -> None:
-    """Write a product's STAC item, which lists the files that are there."""
-    properties = {
-        "version": __version__,
-        "points": record["counts"]["points"],
-        "rows": record["counts"]["rows"],
-        "rows_length_m": record["length_m"],
-        "area_m2": round(float(polygons.area.sum()), 1),
-    }
-    where: dict[str, Any] = {"polygon": polygons.union_all(), "crs": crs, "survey": recipe.survey}
-    item = parcel_item(folder, recipe.parcel, flown=recipe.flown, properties=properties, **where)
-    save(item, paths.stac_item(folder, recipe.parcel))
-
-
-def _write_page(folder: Path, record: dict[str, Any], layers: dict[str, gpd.GeoDataFrame], seen: RowMap) -> list[str]:
-    """Write a product's page, or tell why there is none: a fault of our own in a page costs no product."""
-    parcel = record["parcel"]
-    canopies = paths.canopy_mesh(folder, parcel).read_bytes()
-    try:
-        page = parcel_page(record, layers, seen.dtm, seen.chm, canopies)
-    except MemoryError:
-        raise
-    except Exception as error:  # noqa: BLE001 - as said
-        return [f"it has no page: {own_fault(error)}"]
-    paths.report(folder, parcel).write_text(page, encoding="utf-8")
-    return []
-
-
-class CanopyModel(NamedTuple):
-    """Canopies of a cloud's rows as polygons across them."""
-
-    at: Sections
-    """m sections that have a canopy, without their points."""
-    polygons: NDArray[np.float64]
-    """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
-    table: gpd.GeoDataFrame
-    """The sections in numbers."""
-
-
-def model_canopies(found: RowMap, settings: Settings, *, step: Callable[..., Any] = call) -> CanopyModel:
-    """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3)."""
+    Parameters are as of :func:`map_rows`, which finds the rows.
+    """
+    settings = settings or Settings()
     canopies = step("Sections", find_canopies, found, settings)
-    model: CanopyModel = step("Canopy", model_sections, canopies, settings, found.dtm.crs)
+    options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
+    model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
     return model
 
 
@@ -405,40 +346,6 @@ def find_canopies(found: RowMap, settings: Settings) -> list[Canopy]:
         found.cloud, found.rows, found.gaps, found.dtm, partial(separate_canopy, **separate), **options
     )
     return living_canopies(canopies, **living)
-
-
-def model_sections(canopies: Sequence[Canopy], settings: Settings, crs: CRS) -> CanopyModel:
-    """Model the canopies of sections by polygons (section 3.2)."""
-    models = in_threads(partial(_model_row, settings=settings), canopies or [NO_CANOPY])
-    at = join([model.at for model in models])
-    polygons = np.concatenate([model.polygons for model in models])
-    measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))
-    return CanopyModel(at, polygons, tabulate_sections(at, polygons, measures, crs=crs))
-
-
-class _RowModel(NamedTuple):
-    at: Sections
-    polygons: NDArray[np.float64]
-    measures: Measures
-
-
-def _model_row(canopy: Canopy, *, settings: Settings) -> _RowModel:
-    """Polygons of a row's sections."""
-    options = settings.polygon
-    sections, feet = find_feet(canopy.sections)
-    peeled = peel_sections(sections.points, sections.start, share=options.share)
-    sections = sections.subset(peeled.kept)
-    reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
-    outline, start, grown = grow(peeled.hull, peeled.start, feet, reach)
-    on_foliage = options.foot == "foliage"
-    model = enclose(outline, start, grown if on_foliage else canopy.soil, c=options.c, share=0.0, slide=on_foliage)
-    # The foot that the sections around tell may leave a young vine nothing.
-    valid = model.valid & (np.diff(sections.start) >= max(3, settings.canopy.min_points // 2))
-    if not valid.all():
-        sections = sections.subset(np.repeat(valid, np.diff(sections.start)), valid)
-    areas = model.shared_area[valid], model.area[valid], model.hull_area[valid]
-    measures = measure_sections(sections, grown[valid, 0, 1], areas, c=options.c)
-    return _RowModel(sections.without_points(), model.polygon[valid], measures)
 
 
 def _leaves(found: RowMap, settings: Settings) -> list[Sections]:

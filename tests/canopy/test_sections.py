@@ -13,6 +13,7 @@ from pyproj import CRS
 from vinemap.canopy.feet import find_feet
 from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.growth import foliage_reach
+from vinemap.canopy.model import model_sections
 from vinemap.canopy.numbers import (
     complexity_reduction,
     measure_sections,
@@ -27,7 +28,6 @@ from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.geo.raster import Grid, Raster
-from vinemap.parcel import model_sections
 from vinemap.surfaces.ground import terrain_model
 
 UTM = CRS.from_epsg(32632)

@@ -23,8 +23,10 @@ from vinemap.export.lanes import lanes_between
 from vinemap.export.write import export_products
 from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_parcel
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Vineyard, simulate, write_survey
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import hillside
 
 NAME = "Côte 1"
 UTM = parse_crs("EPSG:32632")

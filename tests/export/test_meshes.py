@@ -19,8 +19,10 @@ from vinemap.export.write import export_products
 from vinemap.geo.crs import Origin, main_to_wgs84, to_main
 from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb, write_glb
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Vineyard, simulate, write_survey
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import hillside
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,15 @@ import shapely.ops
 from click.testing import CliRunner
 
 from vinemap.geo.raster import Grid, Raster, RowField
-from vinemap.measure.accuracy.rows import CANOPY_COLUMNS, COLUMNS, compare, main, measure, pool, table
+from vinemap.measure.accuracy.__main__ import main, measure
+from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, table
+from vinemap.measure.accuracy.rows import compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.parcel import RowMap
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Vineyard, simulate
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate
+from vinemap.simulate.terrain import hillside
 
 AZIMUTH, SPACING = 40.0, 2.4
 

@@ -15,7 +15,7 @@ from vinemap.compute import processes
 from vinemap.errors import ConfigError, VinemapError
 from vinemap.measure.bench import jobs as bench_jobs
 from vinemap.measure.bench import runs as bench
-from vinemap.measure.bench.runs import Bar, Run
+from vinemap.measure.bench.bars import Bar, Run
 
 SECONDS = {"Reading": 1.0, "DTM": 2.0, "Curves": 0.5, "Ends and gaps": 0.25, "Mesh": 0.0, "Writing": 1.0, "All": 5.0}
 

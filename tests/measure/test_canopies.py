@@ -5,12 +5,15 @@ import pandas as pd
 import pytest
 import shapely
 
+from vinemap.canopy.model import CanopyModel
 from vinemap.canopy.numbers import measure_sections, tabulate_sections
 from vinemap.canopy.points import Sections
 from vinemap.measure.accuracy.canopies import compare_canopies, pool_canopies
-from vinemap.parcel import CanopyModel, RowMap
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Vineyard, foliage_outlines, simulate
+from vinemap.parcel import RowMap
+from vinemap.simulate.plants import Vineyard, foliage_outlines
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate
+from vinemap.simulate.terrain import hillside
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from vinemap.config.camera import Camera
 from vinemap.errors import InputError, OutputError
 from vinemap.geo.crs import Start
 from vinemap.odometry.drive import map_drive
+from vinemap.odometry.layers import TRACK_LAYERS
 from vinemap.odometry.poses import moved
-from vinemap.product.layers import TRACK_LAYERS
 from vinemap.simulate.camera import LOW
 
 N = 12

@@ -10,8 +10,9 @@ import shapely
 
 from vinemap.parcel import map_parcel
 from vinemap.product.qgis.print_layout import MAP, map_scale, print_layout
-from vinemap.simulate.scenes import PLACE, hillside
-from vinemap.simulate.survey import Vineyard, simulate, write_survey
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import PLACE, hillside
 
 
 @pytest.fixture(scope="module")

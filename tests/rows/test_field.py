@@ -10,8 +10,11 @@ from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import Grid, Raster, grid_over
 from vinemap.rows.field import estimate_row_field
-from vinemap.simulate.scenes import hillside, rows_of
-from vinemap.simulate.survey import Obstacle, Vineyard, simulate
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate
+from vinemap.simulate.terrain import hillside
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
 

@@ -11,18 +11,12 @@ import shapely
 from pyproj import CRS
 
 from vinemap.geo.crs import to_main
-from vinemap.simulate.scenes import (
-    PLACE,
-    TABLE_2_1,
-    TABLE_2_1_ORIGIN,
-    barolo,
-    family,
-    hillside,
-    rows_of,
-    surface_through,
-    terraced,
-)
-from vinemap.simulate.survey import Obstacle, Vineyard, simulate, write_survey
+from vinemap.simulate.families import family
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import TABLE_2_1, TABLE_2_1_ORIGIN, barolo, rows_of
+from vinemap.simulate.survey import simulate, write_survey
+from vinemap.simulate.terrain import PLACE, hillside, surface_through, terraced
 
 SLOPE = hillside(0.2, uphill=120, seed=4)
 

@@ -7,8 +7,11 @@ from vinemap.cloud.points import PointCloud
 from vinemap.errors import InputError
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import sample
-from vinemap.simulate.scenes import hillside, rows_of, terraced
-from vinemap.simulate.survey import Obstacle, Vineyard, simulate
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate
+from vinemap.simulate.terrain import hillside, terraced
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
 

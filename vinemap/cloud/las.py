@@ -15,6 +15,7 @@ from vinemap.cloud.tiles import Collector
 from vinemap.cloud.zones import deal, zones_of
 from vinemap.compute.threads import ahead
 from vinemap.errors import PASSING, BusyError, InputError, OutsideError
+from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
@@ -44,9 +45,6 @@ DISK = "Failed to use read"
 """What lazrs says of any fault in reading bytes."""
 OURS = (InputError, KeyboardInterrupt, SystemExit, GeneratorExit)
 """What isn't raised by laspy and lazrs, which raise many kinds: a Rust panic isn't even an Exception."""
-
-Boundary = tuple[shapely.Geometry, "CRS"]
-"""A polygon and its CRS."""
 
 
 def read_cloud(
@@ -297,20 +295,6 @@ def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np
         xyz = xyz[np.isfinite(xyz).all(axis=1)]
     xyz[:, 2] *= vertical_unit(source)
     return xyz
-
-
-def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
-    """A boundary's polygon in the CRS to which a file is brought.
-
-    Raises
-    ------
-    InputError
-        If it can't be brought there.
-    """
-    polygon = project(*boundary, target)
-    if not np.isfinite(shapely.bounds(polygon)).all():
-        raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
-    return polygon
 
 
 def _plausible(sample: Points, path: Path) -> tuple[Points, Points]:

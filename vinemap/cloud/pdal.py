@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.cloud.las import OURS, boundary_in, collected, is_copc, opened, unreadable
+from vinemap.cloud.las import OURS, collected, is_copc, opened, unreadable
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
+from vinemap.geo.boundaries import boundary_in
 from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pyproj import CRS
 
-    from vinemap.cloud.las import Boundary
+    from vinemap.geo.boundaries import Boundary
 
 USABLE = "Classification != 7 && Classification != 18 && Withheld == 0"
 """Points that are neither noise nor withheld, as PDAL writes it."""

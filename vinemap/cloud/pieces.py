@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.cloud.las import boundary_in, collected, open_cloud
+from vinemap.cloud.las import collected, open_cloud
 from vinemap.cloud.zones import deal, zones_of
 from vinemap.errors import InputError
+from vinemap.geo.boundaries import boundary_in
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,8 +17,8 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud.las import Boundary
     from vinemap.cloud.tiles import Cloud, Collector
+    from vinemap.geo.boundaries import Boundary
 
 CHUNK = 1_000_000
 """Points that are read back at once."""

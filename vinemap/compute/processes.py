@@ -101,3 +101,13 @@ def resident(process: int) -> int:
         return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return 0
+
+
+def high_water(*, status: Path = Path("/proc/self/status"), reset: Path = Path("/proc/self/clear_refs")) -> int | None:
+    """Most memory (bytes) that this process has held since the last call; None where the system doesn't tell."""
+    try:
+        kilobytes = next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        reset.write_text("5")
+    except (OSError, StopIteration):
+        return None
+    return int(kilobytes) * 1024

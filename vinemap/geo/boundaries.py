@@ -13,6 +13,7 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError
+from vinemap.geo.crs import project
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -23,9 +24,11 @@ if TYPE_CHECKING:
 
 PARCEL_LAYER = "parcel"
 NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
+Boundary = tuple[shapely.Geometry, "CRS"]
+"""A polygon and its CRS."""
 
 
-def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geometry, CRS]:
+def read_boundary(path: Path, *, parcel: str | None = None) -> Boundary:
     """Read the polygon of a parcel from GeoPackage, GeoJSON or Shapefile.
 
     Parameters
@@ -50,9 +53,7 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> tuple[shapely.Geo
     return found
 
 
-def read_parcels(
-    path: Path, names: Sequence[str] | None = None
-) -> dict[str, tuple[shapely.Geometry, CRS] | InputError]:
+def read_parcels(path: Path, names: Sequence[str] | None = None) -> dict[str, Boundary | InputError]:
     """Read the polygons of parcels, or what is wrong with one.
 
     Parameters
@@ -78,7 +79,7 @@ def read_parcels(
             )
         names = list(first)
     places = [words.groupby(words).indices for words in columns.values()]
-    found: dict[str, tuple[shapely.Geometry, CRS] | InputError] = {}
+    found: dict[str, Boundary | InputError] = {}
     for name in names:
         word = unicodedata.normalize("NFC", name)
         rows = next((place[word] for place in places if word in place), None) if len(frame) > 1 else [0]
@@ -155,3 +156,17 @@ def _polygon_layer(path: Path) -> str:
     if len(polygons) > 1 and PARCEL_LAYER not in polygons:
         raise InputError(f"{path}: has several layers of polygons ({', '.join(polygons)}): save the parcels' alone")
     return PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0]
+
+
+def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
+    """A boundary's polygon in the CRS to which a file is brought.
+
+    Raises
+    ------
+    InputError
+        If it can't be brought there.
+    """
+    polygon = project(*boundary, target)
+    if not np.isfinite(shapely.bounds(polygon)).all():
+        raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
+    return polygon

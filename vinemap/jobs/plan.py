@@ -20,8 +20,8 @@ from vinemap.product.store import write_whole
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from vinemap.cloud.las import Boundary
     from vinemap.config.surveys import SurveyConfig
+    from vinemap.geo.boundaries import Boundary
 
 DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
 """What can become of a parcel."""

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud.las import Boundary
     from vinemap.cloud.pieces import Piece
     from vinemap.config.surveys import JobOptions, SurveyConfig
+    from vinemap.geo.boundaries import Boundary
     from vinemap.parcel import Summary
     from vinemap.product.recipe import Recipe
 

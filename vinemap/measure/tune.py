@@ -16,7 +16,8 @@ import shapely
 from scipy.optimize import differential_evolution
 
 from vinemap.canopy.numbers import modelling_indices
-from vinemap.cli.main import FILE, plain_errors
+from vinemap.cli.options import FILE
+from vinemap.cli.terminal import plain_errors
 from vinemap.cloud.las import read_cloud
 from vinemap.config.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.errors import InputError
@@ -27,7 +28,8 @@ from vinemap.parcel import map_rows, model_canopies
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from vinemap.parcel import CanopyModel, RowMap
+    from vinemap.canopy.model import CanopyModel
+    from vinemap.parcel import RowMap
 
     Values = NDArray[np.floating]
 

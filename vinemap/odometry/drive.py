@@ -11,12 +11,11 @@ from vinemap.errors import InputError, OutputError
 from vinemap.geo.crs import WGS84, metric_crs
 from vinemap.geo.lines import read_lines
 from vinemap.odometry.frames import read_recording
-from vinemap.odometry.layers import NOWHERE, beside_rows, track_layers
+from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers
 from vinemap.odometry.poses import STILL
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow
 from vinemap.product.geopackage import write_geopackage
-from vinemap.product.layers import TRACK_LAYERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -15,6 +15,7 @@ from vinemap.errors import InputError
 from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, project
 from vinemap.odometry.poses import Pose, onward
 from vinemap.odometry.track import stretches
+from vinemap.product.layers import REAL, TEXT, TIME, WHOLE, Layer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,10 +34,26 @@ DATED = 1e8
 """Seconds from which on a time counts from 1970."""
 FARTHEST = 2000.0
 """Metres between a start and the nearest row from which on one of them must be wrong."""
+TRACK_LAYERS: dict[str, Layer] = {
+    "track": Layer(
+        "LineString",
+        {"stretch": WHOLE, "n_poses": WHOLE} | dict.fromkeys(("length_m", "seconds", "score"), REAL),
+        "The robot's track: a line for each stretch within which every pose was measured",
+    ),
+    "poses": Layer(
+        "Point",
+        {"pose": WHOLE, "frame": TEXT, "time": TIME, "seconds": REAL}
+        | dict.fromkeys(("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap"), REAL)
+        | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
+        | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
+        "Poses of the robot, one a frame",
+    ),
+}
+"""What the GeoPackage of a robot's track holds."""
 
 
 def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
-    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.product.layers.TRACK_LAYERS`, without rows.
+    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.odometry.layers.TRACK_LAYERS`, without rows.
 
     Parameters
     ----------

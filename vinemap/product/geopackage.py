@@ -65,7 +65,7 @@ def write_geopackage(
 
 
 def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path, contract: Mapping[str, Layer]) -> None:
-    tables = {name: conform(layers[name], name) for name in contract}
+    tables = {name: conform(layers[name], name, contract=contract) for name in contract}
     for name, layer in contract.items():
         with warnings.catch_warnings():
             # An empty column of text has no type of its own to infer.

@@ -12,11 +12,10 @@ from vinemap.geo.crs import project
 from vinemap.rows.blocks import outline_blocks
 
 if TYPE_CHECKING:
-    from pyproj import CRS
+    from collections.abc import Mapping
 
     from vinemap.cloud.tiles import Cloud
-
-    Boundary = tuple[shapely.Geometry, CRS]
+    from vinemap.geo.boundaries import Boundary
 
 TEXT, WHOLE, REAL, TIME = "str", "int64", "float64", "datetime64[ms, UTC]"
 _END = ("x", "y", "z"), ("lat", "lon", "alt")
@@ -68,33 +67,15 @@ LAYERS: dict[str, Layer] = {
 }
 
 
-TRACK_LAYERS: dict[str, Layer] = {
-    "track": Layer(
-        "LineString",
-        {"stretch": WHOLE, "n_poses": WHOLE} | dict.fromkeys(("length_m", "seconds", "score"), REAL),
-        "The robot's track: a line for each stretch within which every pose was measured",
-    ),
-    "poses": Layer(
-        "Point",
-        {"pose": WHOLE, "frame": TEXT, "time": TIME, "seconds": REAL}
-        | dict.fromkeys(("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap"), REAL)
-        | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
-        | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
-        "Poses of the robot, one a frame",
-    ),
-}
-"""What the GeoPackage of a robot's track holds."""
-
-
-def conform(frame: gpd.GeoDataFrame, layer: str) -> gpd.GeoDataFrame:
-    """Bring a table to a layer's columns, in order and with their types.
+def conform(frame: gpd.GeoDataFrame, layer: str, *, contract: Mapping[str, Layer] = LAYERS) -> gpd.GeoDataFrame:
+    """Bring a table to the columns of a layer of a contract, in order and with their types.
 
     Raises
     ------
     ValueError
         If a column is missing.
     """
-    columns = (LAYERS | TRACK_LAYERS)[layer].columns
+    columns = contract[layer].columns
     missing = sorted(set(columns) - set(frame.columns))
     if missing:
         raise ValueError(f"layer {layer} lacks {', '.join(missing)}")

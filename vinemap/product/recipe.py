@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud.las import Boundary
+    from vinemap.geo.boundaries import Boundary
     from vinemap.geo.crs import Origin
 
 SETTLED = 2.0

@@ -22,14 +22,17 @@ from pystac import Asset, Link, MediaType, RelType
 from pystac.extensions.file import FileExtension
 from pystac.extensions.projection import ProjectionExtension
 
-from vinemap import paths
+from vinemap import __version__, paths
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    import geopandas as gpd
     from pyproj import CRS
+
+    from vinemap.product.recipe import Recipe
 
 MEDIA_TYPES = {
     ".glb": "model/gltf-binary",
@@ -261,3 +264,23 @@ def save(described: pystac.Item | pystac.Collection, path: Path) -> None:
     """
     known = described.to_dict(include_self_link=False, transform_hrefs=False)
     write_whole(path, json.dumps(known, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def write_item(folder: Path, recipe: Recipe, record: dict[str, Any], polygons: gpd.GeoDataFrame) -> None:
+    """Write the STAC item of a product, by its recipe, record and polygons; it lists the files that are there.
+
+    Raises
+    ------
+    OSError
+        If it can't be written.
+    """
+    properties = {
+        "version": __version__,
+        "points": record["counts"]["points"],
+        "rows": record["counts"]["rows"],
+        "rows_length_m": record["length_m"],
+        "area_m2": round(float(polygons.area.sum()), 1),
+    }
+    where: dict[str, Any] = {"polygon": polygons.union_all(), "crs": polygons.crs, "survey": recipe.survey}
+    item = parcel_item(folder, recipe.parcel, flown=recipe.flown, properties=properties, **where)
+    save(item, paths.stac_item(folder, recipe.parcel))

@@ -23,14 +23,10 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     import geopandas as gpd
-    import shapely
-    from pyproj import CRS
 
     from vinemap.canopy.mesh import Mesh
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.raster import Raster, RowField
-
-    Boundary = tuple[shapely.Geometry, CRS]
 
 
 def write_product(

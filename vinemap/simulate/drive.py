@@ -9,7 +9,7 @@ import click
 import yaml
 
 from vinemap import paths
-from vinemap.cli.main import frame_progress, plain_errors
+from vinemap.cli.terminal import frame_progress, plain_errors
 from vinemap.odometry.poses import Pose
 from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground, render, sinusoid
 

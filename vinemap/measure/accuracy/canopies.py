@@ -9,7 +9,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap.canopy.numbers import modelling_indices, summarise_rows
-from vinemap.simulate.survey import foliage_outlines
+from vinemap.simulate.plants import foliage_outlines
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from vinemap.parcel import CanopyModel, RowMap
-    from vinemap.simulate.survey import Foliage, Survey
+    from vinemap.canopy.model import CanopyModel
+    from vinemap.parcel import RowMap
+    from vinemap.simulate.plants import Foliage
+    from vinemap.simulate.survey import Survey
 
     Array = NDArray[np.float64]
 

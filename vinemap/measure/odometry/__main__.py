@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from vinemap.cli.main import FILE, plain_errors
+from vinemap.cli.options import FILE
+from vinemap.cli.terminal import plain_errors
 from vinemap.measure.odometry import plots
 from vinemap.measure.odometry.tables import (
     MOST_SECONDS,

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from affine import Affine
 
+from vinemap import paths
+from vinemap.errors import own_fault
 from vinemap.geo.raster import block_sum
 from vinemap.product.pages.page import as_json, page, polylines, rings, whole_numbers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     import geopandas as gpd
     from numpy.typing import NDArray
@@ -190,3 +193,22 @@ def terrain(dtm: Raster) -> dict[str, Any]:
         "lowest": lowest,
         "z": whole_numbers(values.ravel() - lowest, unit=0.01),
     }
+
+
+def write_page(
+    folder: Path, record: dict[str, Any], layers: dict[str, gpd.GeoDataFrame], dtm: Raster, chm: Raster
+) -> list[str]:
+    """Write a product's page, or tell why there is none: a fault of our own in a page costs no product.
+
+    Parameters are as of :func:`parcel_page`, with the product's folder.
+    """
+    parcel = record["parcel"]
+    canopies = paths.canopy_mesh(folder, parcel).read_bytes()
+    try:
+        page = parcel_page(record, layers, dtm, chm, canopies)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - as said
+        return [f"it has no page: {own_fault(error)}"]
+    paths.report(folder, parcel).write_text(page, encoding="utf-8")
+    return []

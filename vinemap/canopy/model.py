@@ -1,0 +1,89 @@
+"""Canopies of rows as polygons across them: the steps from foliage to c-gons, row by row."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vinemap.canopy.cgon import enclose
+from vinemap.canopy.feet import find_feet
+from vinemap.canopy.foliage import NO_CANOPY
+from vinemap.canopy.growth import foliage_reach, grow
+from vinemap.canopy.numbers import Measures, measure_sections, tabulate_sections
+from vinemap.canopy.peeling import peel_sections
+from vinemap.canopy.points import join
+from vinemap.compute.threads import in_threads
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import geopandas as gpd
+    from numpy.typing import NDArray
+    from pyproj import CRS
+
+    from vinemap.canopy.foliage import Canopy
+    from vinemap.canopy.points import Sections
+
+
+class CanopyModel(NamedTuple):
+    """Canopies of a cloud's rows as polygons across them."""
+
+    at: Sections
+    """m sections that have a canopy, without their points."""
+    polygons: NDArray[np.float64]
+    """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
+    table: gpd.GeoDataFrame
+    """The sections in numbers."""
+
+
+def model_sections(
+    canopies: Sequence[Canopy], crs: CRS, *, c: int = 7, share: float = 0.02, foot: str = "foliage", min_points: int = 8
+) -> CanopyModel:
+    """Model the canopies of sections by polygons (section 3.2).
+
+    Parameters
+    ----------
+    canopies : sequence of Canopy
+        One a row.
+    crs : CRS
+        Of their places.
+    c : int
+        Vertices of a polygon.
+    share : float
+        Share of a section's points that is peeled off.
+    foot : str
+        Where v1, v2 and vc stand: "foliage", or the thesis's "soil".
+    min_points : int
+        Canopy points of a section; above a foot that the sections around tell half of them do.
+    """
+    model_row = partial(_model_row, c=c, share=share, on_foliage=foot == "foliage", least=max(3, min_points // 2))
+    models = in_threads(model_row, canopies or [NO_CANOPY])
+    at = join([model.at for model in models])
+    polygons = np.concatenate([model.polygons for model in models])
+    measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))
+    return CanopyModel(at, polygons, tabulate_sections(at, polygons, measures, crs=crs))
+
+
+class _RowModel(NamedTuple):
+    at: Sections
+    polygons: NDArray[np.float64]
+    measures: Measures
+
+
+def _model_row(canopy: Canopy, *, c: int, share: float, on_foliage: bool, least: int) -> _RowModel:
+    """Polygons of a row's sections."""
+    sections, feet = find_feet(canopy.sections)
+    peeled = peel_sections(sections.points, sections.start, share=share)
+    sections = sections.subset(peeled.kept)
+    reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
+    outline, start, grown = grow(peeled.hull, peeled.start, feet, reach)
+    model = enclose(outline, start, grown if on_foliage else canopy.soil, c=c, share=0.0, slide=on_foliage)
+    # The foot that the sections around tell may leave a young vine nothing.
+    valid = model.valid & (np.diff(sections.start) >= least)
+    if not valid.all():
+        sections = sections.subset(np.repeat(valid, np.diff(sections.start)), valid)
+    areas = model.shared_area[valid], model.area[valid], model.hull_area[valid]
+    measures = measure_sections(sections, grown[valid, 0, 1], areas, c=c)
+    return _RowModel(sections.without_points(), model.polygon[valid], measures)

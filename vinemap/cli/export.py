@@ -1,0 +1,42 @@
+"""``vinemap export``: write rows, lanes and canopies for tractors, robots and other programs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vinemap.cli.options import FILE
+from vinemap.export import FORMATS, LINES
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@click.command()
+@click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
+@click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    required=True,
+    type=click.Choice([*FORMATS, "all"]),
+    help="Any number of times.",
+)
+@click.option("--out", type=FILE, help="Folder of the parcels' folders; exports by default.")
+@click.option("--lines", type=click.Choice(LINES), default="lanes", help="What guidance follows; lanes by default.")
+@click.option(
+    "--headland", type=click.FloatRange(0, 50), default=3.0, help="Metres of lanes beyond rows; 3 by default."
+)
+@click.option("--outer", is_flag=True, help="Lanes beside the first row of a block and its last, too.")
+@click.option("--frame", default="map", help="Name of the frame of a robot's coordinates; map by default.")
+@click.option("--grid", is_flag=True, help="Robots' coordinates and meshes in the product's CRS; in {Main} by default.")
+@click.option("--vertices", type=click.IntRange(2, 10_000), help="Vertices of every lane; by default few.")
+def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | None, **options: Any) -> None:
+    """Write the rows of each PRODUCT (its folder or GeoPackage), and lanes between them, for tractors and robots."""
+    from vinemap import paths
+    from vinemap.export.write import export_products
+
+    chosen = FORMATS if "all" in formats else tuple(dict.fromkeys(formats))
+    for line in export_products(products, out or paths.exports(), formats=chosen, **options):
+        click.echo(line)

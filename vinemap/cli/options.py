@@ -1,0 +1,48 @@
+"""Kinds of values that commands take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+FILE = click.Path(path_type=Path)
+
+
+class OriginParam(click.ParamType):  # type: ignore[type-arg]
+    """Origin of {Main}."""
+
+    name = "LAT,LON,ALT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The origin in a text, checked."""
+        from vinemap.geo.crs import Origin, check_origin
+
+        try:
+            lat, lon, alt = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(
+                f"{value!r} isn't latitude, longitude and altitude: for example 44.61167,7.92442,428.7", param, ctx
+            )
+        return check_origin(Origin(lat, lon, alt))
+
+
+class StartParam(click.ParamType):  # type: ignore[type-arg]
+    """Where a robot's first frame was taken."""
+
+    name = "LAT,LON,HEADING"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The start in a text, checked."""
+        from vinemap.geo.crs import Start, check_start
+
+        try:
+            start = Start(*(float(part) for part in str(value).split(",")))
+        except (TypeError, ValueError):
+            self.fail(
+                f"{value!r} isn't latitude, longitude and heading in degrees: for example 44.61167,7.92442,72.5",
+                param,
+                ctx,
+            )
+        return check_start(start)

@@ -1,0 +1,59 @@
+"""``vinemap run``: map one cloud."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vinemap.cli.options import FILE, OriginParam
+from vinemap.cli.terminal import progress
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@click.command()
+@click.argument("cloud", type=FILE)
+@click.option("--boundary", type=FILE, help="Polygon to clip to: GeoPackage, GeoJSON or Shapefile, in any CRS.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none or a wrong one.")
+@click.option("--parcel", help="Name of the parcel; the cloud's by default.")
+@click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
+@click.option("--origin", type=OriginParam(), help="Origin of the local frame {Main}; the parcel's corner by default.")
+@click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+@click.option("--classified", is_flag=True, help="Write the points with a class and a row each, too.")
+@click.option("--plain", is_flag=True, help="Write meshes for readers of glTF that know no extension: larger files.")
+def run(
+    cloud: Path,
+    boundary: Path | None,
+    crs: str | None,
+    parcel: str | None,
+    out: Path | None,
+    origin: Any,
+    settings: Path | None,
+    classified: bool,
+    plain: bool,
+) -> None:
+    """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
+    from vinemap import paths
+    from vinemap.config.names import check_name
+    from vinemap.config.settings import Settings
+    from vinemap.config.surveys import load_settings
+    from vinemap.geo.crs import parse_crs
+
+    name = check_name(parcel) if parcel is not None else paths.stem(cloud)
+    folder = out or paths.product_folder(paths.stem(cloud), name)
+    chosen = load_settings(settings) if settings else Settings()
+    extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}
+    options = {
+        "crs": parse_crs(crs) if crs else None,
+        "settings": chosen.model_copy(update={"product": chosen.product.model_copy(update=extra)}),
+        "boundary": boundary,
+        "origin": origin,
+        "named": parcel is not None,
+    }
+    with progress(name) as step:
+        from vinemap.parcel import map_parcel
+
+        summary = map_parcel(cloud, folder, parcel=name, step=step, **options)
+    click.echo(summary.line())

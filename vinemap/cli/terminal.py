@@ -1,0 +1,91 @@
+"""What people see in a terminal: bars of progress, and errors in one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import click
+
+from vinemap.errors import VinemapError, own_fault
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from rich.progress import Progress, ProgressColumn
+
+T = TypeVar("T")
+
+
+def frame_progress(frames: Iterable[T], count: int) -> Iterator[T]:
+    """Give frames on and move a bar, on stderr."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("Frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with _bar(*columns) as bar:
+        yield from bar.track(frames, total=count)
+
+
+@contextmanager
+def progress(parcel: str) -> Iterator[Callable[..., Any]]:
+    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr."""
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with _bar(*columns) as bar:
+        task = bar.add_task("Starting", total=None, parcel=parcel)
+
+        def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            from vinemap.parcel import STAGES
+
+            bar.update(task, description=name, total=len(STAGES), completed=STAGES.index(name))
+            return function(*args, **kwargs)
+
+        yield step
+
+
+def _bar(*columns: ProgressColumn) -> Progress:
+    """A bar on stderr that isn't there where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Say errors in one line on stderr: exit code 2 for what the user can mend, 1 for a fault of vinemap's own.
+
+    ``VINEMAP_TRACEBACK=1`` lets a fault through with its traceback. A termination signal unwinds like Ctrl-C, so that
+    drafts are removed and servers stopped.
+    """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _stop)
+    try:
+        yield
+    except VinemapError as error:
+        _fail(error, 2)
+    except click.ClickException as error:
+        _fail(error.format_message(), 2)
+    except (KeyboardInterrupt, click.exceptions.Abort):
+        _fail("stopped", 130)
+    except MemoryError:
+        _fail("not enough memory: clip the cloud with --boundary", 2)
+    except Exception as error:
+        if os.environ.get("VINEMAP_TRACEBACK"):
+            raise
+        _fail(f"{own_fault(error)}; VINEMAP_TRACEBACK=1 shows where", 1)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    del frame
+    raise SystemExit(128 + number)
+
+
+def _fail(reason: object, code: int) -> NoReturn:
+    click.echo(f"vinemap: {' '.join(str(reason).split())}", err=True)
+    sys.exit(code)

@@ -1,0 +1,60 @@
+"""``vinemap track``: follow a robot by its camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vinemap.cli.options import FILE, StartParam
+from vinemap.cli.terminal import frame_progress
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SHARE = click.FloatRange(0, 0.8, min_open=True)
+METHODS = ("aligned", "quadratic", "centroid", "maximum")
+
+
+@click.command()
+@click.argument("frames", nargs=-1, required=True, type=FILE)
+@click.option("--camera", type=FILE, required=True, help="YAML file of the camera: see vinemap config camera.")
+@click.option("--out", type=FILE, default="track.gpkg", help="GeoPackage to write; track.gpkg by default.")
+@click.option("--start", type=StartParam(), help="Where the first frame was taken, heading clockwise from north.")
+@click.option("--rows", type=FILE, help="GeoPackage of vine rows, for the distance to the nearest one.")
+@click.option(
+    "--template-share",
+    type=SHARE,
+    default=0.2,
+    help="Template, of the image's height; 0.2.",
+)
+@click.option("--turn", type=click.FloatRange(1, 90), default=9.0, help="Most degrees a frame; 9 by default.")
+@click.option(
+    "--method", type=click.Choice(METHODS), default="aligned", help="How peaks are refined; aligned by default."
+)
+def track(
+    frames: tuple[Path, ...],
+    camera: Path,
+    out: Path,
+    start: Any,
+    rows: Path | None,
+    template_share: float,
+    turn: float,
+    method: Any,
+) -> None:
+    """Follow a robot by the FRAMES of its camera that looks down: images, folders of images, or videos, in order."""
+    from vinemap.config.drives import load_camera
+    from vinemap.odometry.drive import map_drive
+
+    summary = map_drive(
+        frames,
+        out,
+        camera=load_camera(camera),
+        start=start,
+        rows=rows,
+        template_share=template_share,
+        angles=(-turn, turn),
+        method=method,
+        show=frame_progress,
+    )
+    click.echo(summary.line())

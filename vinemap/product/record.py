@@ -1,0 +1,71 @@
+"""The record of a run: what a product was made of, and what is in it."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from vinemap import __version__
+from vinemap.cloud.pdal import pdal_versions
+from vinemap.product.notices import notices
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.geo.crs import Origin
+    from vinemap.geo.raster import Raster
+    from vinemap.product.recipe import Recipe
+
+
+LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
+
+
+def run_record(
+    recipe: Recipe,
+    points: Cloud,
+    layers: dict[str, gpd.GeoDataFrame],
+    chm: Raster,
+    *,
+    origin: Origin,
+    n_key_points: int,
+) -> dict[str, Any]:
+    """What ``run.json`` tells, but for times and files.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        What the product was made of.
+    points : PointCloud or TiledCloud
+        The points that were read.
+    layers : dict of GeoDataFrame
+        Those of the GeoPackage.
+    chm : Raster
+        Canopy height, NaN where there are no points.
+    origin : Origin
+        Of {Main}.
+    n_key_points : int
+        Key points that were found.
+    """
+    sections = layers["sections"]
+    modelling = sections[["good", "under", "over", "reduction", "quality"]].mean().round(4)
+    versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
+    return {
+        "vinemap": __version__,
+        "key": recipe.key,
+        "survey": recipe.survey,
+        "parcel": recipe.parcel,
+        "flown": recipe.flown.isoformat(),
+        "inputs": [source.record() for source in recipe.sources],
+        "settings": recipe.settings.model_dump(mode="json"),
+        "crs": points.crs.to_string(),
+        "vertical_datum": points.vertical,
+        "origin": origin._asdict(),
+        "counts": {"points": points.size, "key_points_found": n_key_points}
+        | {name: len(layer) for name, layer in layers.items()},
+        "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
+        "modelling": modelling.to_dict() if len(sections) else None,
+        "warnings": notices(layers["rows"], chm, layers["parcel"], points.size),
+        "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
+    }

@@ -1,0 +1,172 @@
+"""Families of vineyards on which accuracy is measured: of each as many surveys as there are seeds."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from scipy.interpolate import PchipInterpolator
+from shapely.ops import substring
+
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import Survey, simulate
+from vinemap.simulate.terrain import PLACE, hillside, terraced
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from vinemap.simulate.plants import Array, Terrain
+
+LONG_GAPS = {"gaps": (8, 8, 8, 8, 8, 17), "vine_spacing": 0.9}
+BEFORE_FLOWERING = {"height": 1.3, "half_width": 0.15, "leafiness": 4.0}
+
+
+def family(name: str, seed: int) -> Survey:
+    """Survey of one of the ``FAMILIES``; slopes, directions, spacings, canopies and densities vary with the seed."""
+    return FAMILIES[name](np.random.default_rng([seed, *name.encode()]))._replace(name=name)
+
+
+def _block(rng: np.random.Generator, **shape: Any) -> list[Array]:
+    """Rows as vineyards have them, of any direction, but for what is given."""
+    usual: dict[str, Any] = {
+        "n": rng.integers(6, 10),
+        "length": rng.uniform(35, 55),
+        "spacing": rng.uniform(2.2, 2.9),
+        "azimuth": rng.uniform(0, 180),
+    }
+    return rows_of(**(usual | shape))
+
+
+def _survey(
+    rng: np.random.Generator,
+    *blocks: Sequence[Array],
+    canopy: dict[str, Any] | None = None,
+    slope: float | None = None,
+    terrain: Terrain | None = None,
+    ragged: float = 1.2,
+    **options: Any,
+) -> Survey:
+    """Survey blocks, a parcel each, whose rows end up to ``ragged`` m early; what isn't given is as it often is."""
+    vines: dict[str, Any] = {
+        "height": rng.uniform(1.6, 2.1),
+        "half_width": rng.uniform(0.2, 0.32),
+        "vine_spacing": rng.uniform(0.8, 1.1),
+        "gaps": (2, 3, 4, 5),
+    }
+    vines |= canopy or {}
+    lines = [[shapely.LineString(row) for row in block] for block in blocks]
+    cut = [[substring(line, *rng.uniform(0, ragged, 2) * (1, -1)) for line in block] for block in lines]
+    vineyards = [Vineyard(chr(65 + k), [np.array(c.coords) for c in block], **vines) for k, block in enumerate(cut)]
+    steepness = rng.uniform(0.03, 0.3) if slope is None else slope
+    hill = hillside(
+        steepness, uphill=rng.uniform(0, 360), undulation=rng.uniform(0.05, 0.2), seed=int(rng.integers(1 << 31))
+    )
+    usual: dict[str, Any] = {
+        "density": rng.uniform(200, 450),
+        "weeds": rng.uniform(0.1, 0.25),
+        "noise": rng.uniform(0.02, 0.03),
+        "seed": int(rng.integers(1 << 31)),
+    }
+    return simulate(vineyards, terrain or hill, **(usual | options))
+
+
+def _beyond(block: Sequence[Array], other: Sequence[Array], *, azimuth: float, track: float) -> list[Array]:
+    """Move ``other`` towards an azimuth until a track of so many metres divides it from ``block``."""
+    way = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))])
+    shift = (np.concatenate(list(block)) @ way).max() + track - (np.concatenate(list(other)) @ way).min()
+    return [row + shift * way for row in other]
+
+
+def _terraces(rng: np.random.Generator) -> Survey:
+    azimuth = rng.uniform(0, 180)
+    rows = _block(rng, n=9, spacing=1.8, azimuth=azimuth, radius=rng.choice([math.inf, 80.0]))
+    slope = hillside(0.45, uphill=azimuth + 90, undulation=0.1, seed=int(rng.integers(1 << 31)))
+    terrain = terraced(slope, rows, spacing=1.8, riser=rng.uniform(0.6, 0.8))
+    return _survey(rng, rows, terrain=terrain, canopy={"half_width": rng.uniform(0.18, 0.25)})
+
+
+def _two_blocks(rng: np.random.Generator) -> Survey:
+    azimuth, spacing = rng.uniform(0, 180), rng.uniform(2.0, 2.4)
+    one = _block(rng, azimuth=azimuth, spacing=spacing, length=35)
+    other = _block(rng, azimuth=azimuth + rng.uniform(30, 150), spacing=spacing + rng.uniform(0.3, 0.7), length=35)
+    return _survey(rng, one, _beyond(one, other, azimuth=rng.uniform(0, 360), track=5))
+
+
+def _headland(rng: np.random.Generator) -> Survey:
+    azimuth, spacing, n = rng.uniform(0, 180), rng.uniform(2.2, 2.9), rng.integers(6, 9)
+    one, other = (_block(rng, n=n, azimuth=azimuth, spacing=spacing, length=rng.uniform(24, 32)) for _ in range(2))
+    return _survey(rng, one, _beyond(one, other, azimuth=azimuth, track=6), ragged=0.3)
+
+
+def _close(rng: np.random.Generator) -> Survey:
+    """A row that starts 1.5 m from its neighbour, which makes room for it, as row 15 does beside row 14."""
+    azimuth, spacing, length = rng.uniform(0, 180), rng.uniform(2.3, 2.8), 50.0
+    rows = rows_of(7, length=length, spacing=spacing, azimuth=azimuth)
+    left = np.array([-math.sin(math.radians(azimuth)), math.cos(math.radians(azimuth))])
+    along = np.linspace(0, 1, len(rows[0]))
+    start = rng.uniform(0.2, 0.5)
+    rows[3] = rows[3] - PchipInterpolator([0, start, 1], [0, 0.5, 0])(along)[:, None] * left
+    late = np.clip((along - start) / (1 - start), 0, 1)
+    rows[4] = (rows[4] - ((spacing - 1.0) * (1 - late))[:, None] * left)[along >= start]
+    return _survey(rng, rows, ragged=0.1)
+
+
+def _clutter(rng: np.random.Generator) -> Survey:
+    """Trees, a hut and a hedge around, and between the rows posts and a wire."""
+    n, length, spacing, azimuth = 7, 45.0, rng.uniform(2.3, 2.8), rng.uniform(0, 180)
+    cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+    side = n / 2 * spacing
+
+    def at(along: float, across: float, size: tuple[float, float], top: float, **kind: Any) -> Obstacle:
+        x, y = PLACE[0] + along * cos - across * sin, PLACE[1] + along * sin + across * cos
+        return Obstacle(x, y, *size, top, azimuth=azimuth, **kind)
+
+    lanes = (rng.integers(1, n - 1, 6) - n / 2) * spacing
+    obstacles = [at(rng.uniform(-22, 22), lane, (0.05, 0.05), 2.2, solid=True) for lane in lanes[1:]]
+    obstacles += [at(along, lanes[0], (0.5, 0.012), 1.62, bottom=1.6, solid=True) for along in range(-12, 12)]
+    obstacles += [
+        at(length / 2 + 4, rng.uniform(-side, side), (2.2, 1.9), 5.5, bottom=1.3),
+        at(-length / 2 - 3.5, rng.uniform(-side, side), (1.6, 1.8), 4.0, bottom=0.8),
+        at(rng.uniform(-15, 15), side + 3.5, (2.0, 1.6), 2.7, solid=True),
+        at(rng.uniform(-10, 10), -side - 2.5, (5.0, 0.7), 1.7),
+    ]
+    return _survey(rng, rows_of(n, length=length, spacing=spacing, azimuth=azimuth), obstacles=obstacles)
+
+
+def _none(rng: np.random.Generator) -> Survey:
+    """A meadow in high grass with trees, bushes, a hedge and a hut."""
+    x, y = np.add(PLACE, rng.uniform(-24, 24, (12, 2))).T
+    crown, height = rng.uniform(0.6, 2.8, (10, 2)), rng.uniform(1, 8, 10)
+    obstacles = [Obstacle(x[k], y[k], crown[k, 0], crown[k, 1], height[k], bottom=height[k] / 5) for k in range(10)]
+    obstacles += [Obstacle(x[10], y[10], 6.0, 0.7, 1.8, azimuth=rng.uniform(0, 180))]
+    obstacles += [Obstacle(x[11], y[11], 4.0, 3.0, 4.5, solid=True, azimuth=rng.uniform(0, 180))]
+    outline = shapely.box(*np.add(PLACE, -30), *np.add(PLACE, 30))
+    return _survey(rng, [], canopy={"gaps": (), "outline": outline}, density=200.0, weeds=0.4, obstacles=obstacles)
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
+    "straight": lambda rng: _survey(rng, _block(rng)),
+    "curved": lambda rng: _survey(rng, _block(rng, radius=rng.choice([-40, 40]))),
+    "fan": lambda rng: _survey(rng, _block(rng, fan=rng.uniform(5, 9))),
+    "long-gaps": lambda rng: _survey(rng, _block(rng), canopy=LONG_GAPS),
+    "dead": lambda rng: _survey(rng, _block(rng), canopy={"dead": 0.4, "gaps": ()}),
+    "terraces": _terraces,
+    "steep": lambda rng: _survey(rng, _block(rng), slope=0.45),
+    "weeds": lambda rng: _survey(rng, _block(rng), weeds=0.5),
+    "sparse": lambda rng: _survey(rng, _block(rng), density=rng.uniform(60, 150)),
+    "thin": lambda rng: _survey(rng, _block(rng), canopy=BEFORE_FLOWERING),
+    "two-blocks": _two_blocks,
+    "wide": lambda rng: _survey(rng, _block(rng, spacing=3.5)),
+    "short": lambda rng: _survey(rng, _block(rng, length=10), ragged=0.5),
+    "single": lambda rng: _survey(rng, _block(rng, n=1)),
+    "headland": _headland,
+    "close": _close,
+    "clutter": _clutter,
+    "none": _none,
+}
+"""Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
+dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""

@@ -1,0 +1,117 @@
+"""Rays from above that meet leaves, trees, huts, or the ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinemap.simulate.plants import EDGE, LAYERS, Array, Stations, Terrain, bulge
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+STEPS = 14  # steps of a ray through a canopy
+TAN_WIDEST = math.tan(math.radians(35))
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A tree or bush (ellipsoid of leaves), or a hut, post or wire (solid box); metres, heights above its ground."""
+
+    x: float
+    y: float
+    half_length: float
+    half_width: float
+    top: float
+    bottom: float = 0.0
+    solid: bool = False
+    azimuth: float = 0.0
+    """Direction of its length, degrees anticlockwise from east."""
+
+
+def meet_leaves(
+    rays: tuple[Array, Array],
+    nearest: NDArray[np.intp],
+    at_height: float,
+    stations: Stations,
+    rng: np.random.Generator,
+) -> Array:
+    """Height above ``aim`` at which rays meet a leaf of one row, 0 where they don't.
+
+    Parameters
+    ----------
+    rays : arrays (n, 3), (n, 2)
+        ``aim``, where they end on the ground, and ``lean``, their horizontal way for every metre up.
+    nearest, at_height : array (n,), float
+        The station nearest to a ray (one past the last: none near) where it passes this height above ``aim``.
+    """
+    aim, lean = rays
+    met = np.zeros(len(aim))
+    near = np.flatnonzero(nearest < len(stations.arc))
+    if len(near) == 0:
+        return met
+    aim, lean, nearest = aim[near], lean[near], nearest[near]
+    offset = aim[:, :2] + at_height * lean - stations.xy[nearest]
+    (ax, ay), (lx, ly) = stations.along[nearest].T, lean.T
+    s, ds = offset[:, 0] * ax + offset[:, 1] * ay, lx * ax + ly * ay  # along the row, from the station
+    c, dc = offset[:, 1] * ax - offset[:, 0] * ay, ly * ax - lx * ay
+    dc = np.where(np.abs(dc) < 1e-9, 1e-9, dc)
+
+    widest = stations.half_width.max() + np.abs(stations.shift).max() + EDGE
+    level = stations.ground[nearest] - aim[:, 2]
+    one, two = at_height + (-widest - c) / dc, at_height + (widest - c) / dc
+    high = np.minimum(level + stations.top.max(), np.maximum(one, two))
+    low = np.maximum(np.maximum(level + stations.bottom.min(), 0.02), np.minimum(one, two))
+    through = np.flatnonzero(high > low)
+    s, ds, c, dc, high, low = (value[through] for value in (s, ds, c, dc, high, low))
+    nearest, z = nearest[through], aim[through, 2]
+    per_metre, last = 1 / stations.step[nearest], len(stations.arc) - 1
+
+    drop = (high - low) / STEPS
+    path = drop * np.sqrt(1 + np.sum(lean[through] ** 2, axis=1))
+    depth, needed, rise = np.zeros(len(z)), rng.exponential(size=len(z)), np.zeros(len(z))
+    up = high - drop * rng.random(len(z))
+    for _ in range(STEPS):
+        ahead = up - at_height
+        cell = np.clip(nearest + np.rint((s + ahead * ds) * per_metre).astype(int), 0, last)
+        base = stations.ground[cell] + stations.bottom[cell]
+        relative = (z + up - base) / (stations.top[cell] - stations.bottom[cell])
+        width = stations.half_width[cell] * bulge(relative)
+        within = np.clip((width - np.abs(c + ahead * dc - stations.shift[cell])) / EDGE + 0.5, 0, 1)
+        within[(relative < 0) | (relative >= 1)] = 0
+        layer = (np.clip(relative, 0, 0.999) * LAYERS).astype(int)
+        depth += within * stations.leaves[cell, layer] * path
+        rise = np.where((rise == 0) & (depth >= needed), up, rise)
+        up -= drop
+    met[near[through]] = rise
+    return met
+
+
+def meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain, rng: np.random.Generator) -> Array:
+    """Height above ``aim`` at which rays meet a tree or a hut, 0 where they don't."""
+    met = np.zeros(len(aim))
+    reach = math.hypot(obstacle.half_length, obstacle.half_width) + TAN_WIDEST * obstacle.top + 1
+    near = np.flatnonzero(np.hypot(aim[:, 0] - obstacle.x, aim[:, 1] - obstacle.y) < reach)
+    ground = float(terrain(np.array([obstacle.x]), np.array([obstacle.y]))[0])
+    half_height = (obstacle.top - obstacle.bottom) / 2
+    half = np.array([obstacle.half_length, obstacle.half_width, half_height])
+    # In units of the half axes: a point of the ray is start + rise * way.
+    cos, sin = math.cos(math.radians(obstacle.azimuth)), math.sin(math.radians(obstacle.azimuth))
+    own_axes = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    start = (aim[near] - [obstacle.x, obstacle.y, ground + obstacle.bottom + half_height]) @ own_axes / half
+    way = np.column_stack([lean[near], np.ones(len(near))]) @ own_axes / half
+    if obstacle.solid:
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        faces = np.sort([(-1 - start) / way, (1 - start) / way], axis=0)
+        low, high = faces[0].max(axis=1), faces[1].min(axis=1)
+        rise = high
+    else:
+        a, b, c = (way**2).sum(axis=1), (way * start).sum(axis=1), (start**2).sum(axis=1) - 1
+        root = np.sqrt(np.maximum(b**2 - a * c, 0))
+        low, high = (-b - root) / a, (-b + root) / a
+        rise = high - rng.exponential(0.35, len(near))
+    met[near] = np.where((rise > np.maximum(low, 0)) & (high > low), rise, 0)
+    return met
