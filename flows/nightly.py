@@ -42,7 +42,7 @@ class Night(NamedTuple):
 
 
 @flow(name="nightly", persist_result=False)
-def nightly(config: str = "configs/nightly.yaml") -> State[list[Night]]:
+def nightly(config: str = str(paths.ESTATE)) -> State[list[Night]]:
     """Map the parcels of all surveys that need it; failed if one of them fails.
 
     Parameters
@@ -90,7 +90,7 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
-@click.argument("config", default="configs/nightly.yaml")
+@click.argument("config", default=str(paths.ESTATE))
 @click.option("--serve", "served", is_flag=True, help="Stay, and do it when CONFIG says.")
 @click.option("--every", type=click.FloatRange(1), help="Seconds from run to run, instead of CONFIG's cron.")
 def command(config: str, served: bool, every: float | None) -> None:

@@ -15,6 +15,19 @@ PIECES = ".pieces-"
 RUN = "run.json"
 ESTATE = Path("configs/nightly.yaml")
 """Configuration of the estate whose surveys come night after night."""
+OWN_CONFIGURATION = "survey.yaml"
+"""File in a survey's folder that says what is otherwise in it."""
+TRACK = Path("track.gpkg")
+"""Track of a robot, where nobody says otherwise."""
+QGIS_PROJECT = "project.qgs"
+"""The project in a ``.qgz``."""
+MATERIALS, MODEL, MODEL_CONFIG = "vineyard.mtl", "model.sdf", "model.config"
+"""Files of a model of Gazebo."""
+TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
+"""The thesis's table of rows."""
+WEB = Path(__file__).parent / "product" / "pages" / "web"
+PAGE_STYLE, PAGE_LICENCES = WEB / "dist" / "style.css", WEB / "dist" / "LICENSES.txt"
+"""Style of pages, and the licences of what they bundle."""
 
 
 def stem(cloud: Path) -> str:
@@ -35,12 +48,27 @@ def shown(path: Path | str) -> str:
 
 def survey_cloud(survey: str) -> Path:
     """Cloud of a survey."""
-    return DATA / "surveys" / survey / f"{survey}.laz"
+    return cloud(DATA / "surveys" / survey, survey)
 
 
 def survey_boundaries(survey: str) -> Path:
     """Polygons of a survey's parcels."""
-    return DATA / "surveys" / survey / "parcels.gpkg"
+    return boundaries(DATA / "surveys" / survey)
+
+
+def cloud(folder: Path, survey: str) -> Path:
+    """Cloud of a survey in its folder."""
+    return folder / f"{survey}.laz"
+
+
+def boundaries(folder: Path) -> Path:
+    """Polygons of a survey's parcels in its folder."""
+    return folder / "parcels.gpkg"
+
+
+def truth(folder: Path) -> Path:
+    """What is true of a simulated survey."""
+    return folder / "truth.gpkg"
 
 
 def survey_products(survey: str) -> Path:
@@ -108,6 +136,11 @@ def drive_frames(folder: Path) -> Path:
     return folder / "frames"
 
 
+def drive_frame(folder: Path, seconds: float) -> Path:
+    """Frame of a robot's drive, named by its time."""
+    return folder / f"{seconds:.3f}.png"
+
+
 def drive_camera(folder: Path) -> Path:
     """File of the camera that took them."""
     return folder / "camera.yaml"
@@ -146,6 +179,31 @@ def agopengps_field(folder: Path, parcel: str) -> Path:
 def agopengps_file(folder: Path, kind: str) -> Path:
     """File of a field of AgOpenGPS."""
     return folder / f"{kind}.txt"
+
+
+def gazebo_mesh(folder: Path, kind: str) -> Path:
+    """Mesh of a model of Gazebo."""
+    return folder / f"{kind}.obj"
+
+
+def gazebo_world(folder: Path, name: str) -> Path:
+    """World of Gazebo in which a model stands."""
+    return folder / f"{name}.sdf"
+
+
+def piece(folder: Path, number: int) -> Path:
+    """Points of one of a survey's parcels, while it is worked."""
+    return folder / f"{number}.xyz"
+
+
+def tile(folder: Path, column: int, row: int) -> Path:
+    """Points of a tile of a cloud too large for memory."""
+    return folder / f"{column}_{row}.xyz"
+
+
+def geopackage_draft(path: Path) -> Path:
+    """Where a GeoPackage is written before it takes its place."""
+    return path.with_name(f".{path.name}.part.gpkg")
 
 
 def tiles(folder: Path) -> Path:
@@ -193,7 +251,11 @@ def index(folder: Path) -> Path:
     return folder / "index.html"
 
 
-def page_part(name: str) -> Path:
-    """A template, script or style that pages are made of: ``report.html``, ``report.js``."""
-    web = Path(__file__).parent / "product" / "pages" / "web"
-    return web / name if name.endswith(".html") else web / "dist" / name
+def page_template(name: str) -> Path:
+    """Template of a page."""
+    return WEB / f"{name}.html"
+
+
+def page_script(name: str) -> Path:
+    """Script of a page, bundled."""
+    return WEB / "dist" / f"{name}.js"

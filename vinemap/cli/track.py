@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vinemap import paths
 from vinemap.cli.options import FILE, StartParam
 from vinemap.cli.terminal import frame_progress
 
@@ -19,7 +20,7 @@ METHODS = ("aligned", "quadratic", "centroid", "maximum")
 @click.command()
 @click.argument("frames", nargs=-1, required=True, type=FILE)
 @click.option("--camera", type=FILE, required=True, help="YAML file of the camera: see vinemap config camera.")
-@click.option("--out", type=FILE, default="track.gpkg", help="GeoPackage to write; track.gpkg by default.")
+@click.option("--out", type=FILE, default=paths.TRACK, help="GeoPackage to write; track.gpkg by default.")
 @click.option("--start", type=StartParam(), help="Where the first frame was taken, heading clockwise from north.")
 @click.option("--rows", type=FILE, help="GeoPackage of vine rows, for the distance to the nearest one.")
 @click.option(

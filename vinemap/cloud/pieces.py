@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap import paths
 from vinemap.cloud.las import collected, open_cloud
 from vinemap.cloud.zones import deal, zones_of
 from vinemap.errors import InputError
@@ -63,24 +64,24 @@ def split_cloud(
     """
     with open_cloud(cloud, crs=crs) as (target, vertical, chunks):
         pieces: list[Piece | InputError] = []
-        polygons, paths = [], []
+        polygons, files = [], []
         for number, boundary in enumerate(boundaries):
             try:
                 polygons.append(boundary_in(boundary, target, cloud))
             except InputError as error:
                 pieces.append(error)
             else:
-                paths.append(folder / f"{number}.xyz")
-                pieces.append(Piece(paths[-1], cloud, target, vertical))
+                files.append(paths.piece(folder, number))
+                pieces.append(Piece(files[-1], cloud, target, vertical))
         if not polygons:
             return pieces
         zones = zones_of(polygons)
-        for path in paths:
+        for path in files:
             path.touch()
         for chunk in chunks:
             xyz, start = deal(chunk, zones)
             for k in np.flatnonzero(np.diff(start)):
-                with paths[k].open("ab") as stream:
+                with files[k].open("ab") as stream:
                     stream.write(xyz[start[k] : start[k + 1]].data)
     return pieces
 

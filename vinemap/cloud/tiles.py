@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
+from vinemap import paths
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import extent, squares
 
@@ -143,7 +144,7 @@ class Collector:
         order = np.argsort(tile.astype(np.min_scalar_type(tile.max())), kind="stable")
         for member in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
             points = xyz[member]
-            path = self.folder / f"{column[member[0]]}_{row[member[0]]}.xyz"
+            path = paths.tile(self.folder, int(column[member[0]]), int(row[member[0]]))
             with path.open("ab") as stream:
                 stream.write(points.data)
             low, high = extent(points)

@@ -93,17 +93,17 @@ def write_gazebo(field: Field, folder: Path) -> None:
     name = re.sub(r"\W+", "_", f"{field.parcel}_vineyard", flags=re.ASCII)
     model = folder / name
     (model / "meshes").mkdir(parents=True)
-    (model / "meshes" / "vineyard.mtl").write_text(MATERIALS, encoding="utf-8")
+    (model / "meshes" / paths.MATERIALS).write_text(MATERIALS, encoding="utf-8")
     parts = {kind: meshes for kind, meshes in {"canopy": canopy.meshes, "terrain": [ground]}.items() if _faces(meshes)}
     for kind, meshes in parts.items():
-        how: dict[str, Any] = {"comments": canopy.comments(), "material": ("vineyard.mtl", kind)}
-        write_obj(meshes, model / "meshes" / f"{kind}.obj", **how)
+        how: dict[str, Any] = {"comments": canopy.comments(), "material": (paths.MATERIALS, kind)}
+        write_obj(meshes, paths.gazebo_mesh(model / "meshes", kind), **how)
     links = "".join(LINK.format(part=part, model=name) for part in parts)
     title = escape(f"Vineyard {field.parcel}")
-    (model / "model.config").write_text(CONFIG.format(title=title), encoding="utf-8")
-    (model / "model.sdf").write_text(MODEL.format(model=name, links=links), encoding="utf-8")
+    (model / paths.MODEL_CONFIG).write_text(CONFIG.format(title=title), encoding="utf-8")
+    (model / paths.MODEL).write_text(MODEL.format(model=name, links=links), encoding="utf-8")
     world = WORLD.format(model=name, **field.origin._asdict())
-    (folder / f"{name}.sdf").write_text(world, encoding="utf-8")
+    paths.gazebo_world(folder, name).write_text(world, encoding="utf-8")
 
 
 def _faces(meshes: list[Mesh]) -> bool:

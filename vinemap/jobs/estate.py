@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 CLOUDS = (".las", ".laz")
 POLYGONS = (".gpkg", ".geojson", ".shp")
-OWN = "survey.yaml"
-"""File in a survey's folder that says what is otherwise in it."""
 USUAL = ("parcels", "boundaries", "boundary")
 """What the file of the parcels' polygons is called where there are others."""
 LATE = 86_400
@@ -87,16 +85,18 @@ def _arrival(name: str, path: Path, estate: EstateConfig, now: float) -> Arrival
     polygons = [p for p in files if p.suffix.lower() in POLYGONS]
     if len(polygons) > 1:
         polygons = [p for p in polygons if p.stem.lower() in USUAL] or polygons
-    own = path / OWN if path.is_dir() and (path / OWN).is_file() else None
+    own = path / paths.OWN_CONFIGURATION if path.is_dir() and (path / paths.OWN_CONFIGURATION).is_file() else None
     if not clouds and not own:
         return None
     config = estate.of_survey(name, own, cloud=_only(clouds), boundaries=_only(polygons))
     for found, kind, chosen in ((clouds, "clouds", config.cloud), (polygons, "files of polygons", config.boundaries)):
         if len(found) > 1 and not chosen:
             key = "cloud" if found is clouds else "boundaries"
-            raise InputError(f"{path}: holds {len(found)} {kind}: name one in its {OWN}, as '{key}: FILE'")
+            raise InputError(
+                f"{path}: holds {len(found)} {kind}: name one in its {paths.OWN_CONFIGURATION}, as '{key}: FILE'"
+            )
     if not config.cloud:
-        raise InputError(f"{path}: holds no cloud, and its {OWN} names none")
+        raise InputError(f"{path}: holds no cloud, and its {paths.OWN_CONFIGURATION} names none")
     used = [p for p in (config.cloud, config.boundaries, own) if p]
     for file in used:
         _check(file)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pyogrio
 import shapely
 
+from vinemap import paths
 from vinemap.errors import InputError, OutputError
 from vinemap.geo.crs import WGS84, metric_crs
 from vinemap.geo.lines import read_lines
@@ -191,7 +192,7 @@ def _check_out(out: Path, rows: Path | None) -> None:
 
 def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:
     out = out.resolve()
-    draft = out.with_name(f".{out.name}.part.gpkg")
+    draft = paths.geopackage_draft(out)
     try:
         draft.unlink(missing_ok=True)
         write_geopackage(layers, draft, contract=TRACK_LAYERS)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pyogrio
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
+from vinemap import paths
 from vinemap.errors import OutputError
 from vinemap.product.layers import LAYERS, Layer, conform
 from vinemap.product.qgis.style import layer_styles
@@ -91,7 +92,7 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     OutputError
         If it can't be written.
     """
-    draft = path.with_name(f".{path.name}.part.gpkg")
+    draft = paths.geopackage_draft(path)
     try:
         pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
         draft.replace(path)

@@ -36,7 +36,7 @@ def record(folder: Path, ground: Ground, poses: Sequence[Pose], *, seed: int = 0
     frames.mkdir(parents=True, exist_ok=True)
     for k, pose in enumerate(frame_progress(poses, len(poses))):
         image = render(ground, pose, seed=seed + k)
-        cv2.imwrite(str(frames / f"{BEGUN + k * PERIOD:.3f}.png"), image)
+        cv2.imwrite(str(paths.drive_frame(frames, BEGUN + k * PERIOD)), image)
     keys = LOW.model_dump(exclude_defaults=True)
     paths.drive_camera(folder).write_text(yaml.safe_dump(keys, sort_keys=False), encoding="utf-8")
 

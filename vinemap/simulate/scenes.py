@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from vinemap import paths
 from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
@@ -16,9 +16,10 @@ from vinemap.simulate.survey import Survey, simulate
 from vinemap.simulate.terrain import PLACE, hillside, surface_through
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vinemap.simulate.plants import Array
 
-TABLE_2_1 = Path(__file__).parents[2] / "data" / "table_2_1.csv"
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6
 """How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
@@ -67,7 +68,9 @@ def rows_of(
     return rows
 
 
-def barolo(*, density: float = 380.0, density_outside: float = 60.0, seed: int = 1, table: Path = TABLE_2_1) -> Survey:
+def barolo(
+    *, density: float = 380.0, density_outside: float = 60.0, seed: int = 1, table: Path = paths.TABLE_2_1
+) -> Survey:
     """Survey of three parcels in Barolo, EPSG:32632: Table 2.1's parcel F, a contour vineyard, two blocks.
 
     F's rows end where the thesis's do and keep its mean elevations; the rest of the hillside is made up.

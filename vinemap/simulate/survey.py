@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
+from vinemap import paths
 from vinemap.simulate.plants import (
     Array,
     Foliage,
@@ -174,11 +176,14 @@ def write_survey(survey: Survey, folder: Path | str) -> Path:
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = survey.xyz.T
     with tempfile.TemporaryDirectory(prefix=".writing-", dir=folder) as aside:
-        survey.parcels.to_file(Path(aside, "parcels.gpkg"), layer="parcels", VERSION="1.2")
-        survey.rows.to_file(Path(aside, "truth.gpkg"), layer="rows", VERSION="1.2")
-        survey.dead_vines.to_file(Path(aside, "truth.gpkg"), layer="dead_vines", mode="a")
-        survey.gaps.to_file(Path(aside, "truth.gpkg"), layer="gaps", mode="a")
-        cloud.write(str(Path(aside, f"{survey.name}.laz")))
-        for made in ("parcels.gpkg", "truth.gpkg", f"{survey.name}.laz"):
-            Path(aside, made).replace(folder / made)
-    return folder / f"{survey.name}.laz"
+        made = [
+            place(Path(aside)) for place in (paths.boundaries, paths.truth, partial(paths.cloud, survey=survey.name))
+        ]
+        survey.parcels.to_file(made[0], layer="parcels", VERSION="1.2")
+        survey.rows.to_file(made[1], layer="rows", VERSION="1.2")
+        survey.dead_vines.to_file(made[1], layer="dead_vines", mode="a")
+        survey.gaps.to_file(made[1], layer="gaps", mode="a")
+        cloud.write(str(made[2]))
+        for path in made:
+            path.replace(folder / path.name)
+    return paths.cloud(folder, survey.name)

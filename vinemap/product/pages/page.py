@@ -20,6 +20,7 @@ from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import ArrayLike
 
@@ -59,8 +60,8 @@ def page(
     ----------
     https://www.w3.org/TR/CSP3/
     """
-    parts = [_part(f"{script}.js") for script in (name, *scripts)]
-    style = _part("style.css")
+    parts = [_part(paths.page_script(script)) for script in (name, *scripts)]
+    style = _part(paths.PAGE_STYLE)
     policy = (
         f"default-src 'none'; script-src {' '.join(_hash(part) for part in parts)}; style-src {_hash(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
@@ -69,8 +70,8 @@ def page(
         f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:], strict=True)
     ]
     blocks = [f'<script type="text/plain" id="{key}">{_pack(value)}</script>' for key, value in packed.items()]
-    licences = f'<script type="text/plain" id="licences">\n{_part("LICENSES.txt")}\n</script>'
-    return Template(_part(f"{name}.html")).substitute(
+    licences = f'<script type="text/plain" id="licences">\n{_part(paths.PAGE_LICENCES)}\n</script>'
+    return Template(_part(paths.page_template(name))).substitute(
         policy=policy,
         key=html.escape(key),
         title=html.escape(title),
@@ -83,13 +84,13 @@ def page(
 
 def page_hash(name: str) -> str:
     """Changes when a page's template, script or style does."""
-    parts = (f"{name}.html", f"{name}.js", "style.css")
+    parts = paths.page_template(name), paths.page_script(name), paths.PAGE_STYLE
     return hashlib.sha256("".join(map(_part, parts)).encode()).hexdigest()
 
 
 @cache
-def _part(name: str) -> str:
-    return paths.page_part(name).read_text(encoding="utf-8").strip("\n")
+def _part(path: Path) -> str:
+    return path.read_text(encoding="utf-8").strip("\n")
 
 
 @cache

@@ -10,6 +10,7 @@ import zipfile
 from typing import TYPE_CHECKING, NamedTuple
 from xml.etree.ElementTree import Element, tostring
 
+from vinemap import paths
 from vinemap.geo.crs import WGS84
 from vinemap.product.qgis.print_layout import print_layout
 from vinemap.product.qgis.style import Style, raster_style, relief_style, vector_style
@@ -134,7 +135,7 @@ def project(
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         # Without a date of its own it would have today's.
-        name = zipfile.ZipInfo("project.qgs", date_time=(1980, 1, 1, 0, 0, 0))
+        name = zipfile.ZipInfo(paths.QGIS_PROJECT, date_time=(1980, 1, 1, 0, 0, 0))
         archive.writestr(name, text, compress_type=zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
