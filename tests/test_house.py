@@ -1,6 +1,7 @@
-"""The house's own rules: who imports whom, names, what starts quickly, what is pinned."""
+"""The house's own rules: its rooms and their order, names, what starts quickly, what is pinned."""
 
 import ast
+import graphlib
 import json
 import re
 import subprocess
@@ -11,127 +12,68 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-MODULES = sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")])
-
-BASE = {"errors", "crs", "compiled", "machine"}
-DATA = {
+ROOMS = [
+    "errors",
+    "paths",
+    "compute",
+    "geo",
+    "config",
     "cloud",
-    "raster",
-    "vector",
-    "mesh",
-    "row_frame",
-    "zones",
-    "bins",
-    "las",
-    "las_end",
-    "pieces",
-    "tiles",
-    "pdal_engine",
-    "camera",
-    "poses",
-    "correlation",
-}
+    "surfaces",
+    "rows",
+    "canopy",
+    "evaluate",
+    "product",
+    "odometry",
+    "export",
+    "parcel",
+    "jobs",
+    "cli",
+    "__main__",
+    "simulate",
+    "measure",
+    "flows",
+]
+"""From the ground up: a module may import its own room and those above it in this list, never those below."""
 STAGES = {
-    "ground",
-    "cover",
-    "row_field",
-    "key_points",
-    "clustering",
-    "curves",
-    "row_fit",
-    "row_table",
-    "blocks",
-    "confidence",
-    "missing",
+    "surfaces": {"ground", "canopy_height", "cover"},
+    "rows": {"field", "key_points", "clusters", "curves", "fit", "blocks", "confidence", "missing", "numbers"},
+    "canopy": {"sections", "foliage", "feet", "growth", "cgon", "numbers", "mesh", "classification"},
 }
-STAGES |= {"sections", "canopy", "cgon", "section_table", "classification", "odometry"}
-BESIDE = {"evaluate", "synthetic", "scenes"}
-GUIDANCE = {"agopengps", "geojson", "isoxml", "nav2", "opennav_coverage", "shapefile"}
-SETTINGS = {"settings", "config", "paths"}
-CHAIN = BASE | DATA | STAGES | BESIDE | SETTINGS
-# What each module of vinemap, and any flow, may import of vinemap. Its version is everyone's.
-MAY_IMPORT = {
-    "__init__": set(),
-    "errors": set(),
-    "compiled": {"machine"},
-    "machine": set(),
-    "crs": {"errors"},
-    "symbology": set(),
-    "style": {"symbology"},
-    "print_layout": {"symbology"},
-    "project": BASE | {"style", "symbology", "print_layout", "raster"},
-    "json_values": set(),
-    "tables": set(),
-    "processes": {"errors"},
-    **dict.fromkeys(DATA, BASE | DATA | {"style", "json_values"}),
-    "camera": {"settings"},
-    **dict.fromkeys(STAGES, BASE | DATA),
-    **dict.fromkeys(BESIDE, BASE | {"vector", "cloud"}),
-    "scenes": BASE | {"synthetic"},
-    "virtual_camera": {"errors", "camera", "poses"},
-    "virtual_drive": {"cli", "paths", "poses", "virtual_camera"},
-    "virtual_steps": {"camera", "poses", "virtual_camera"},
-    "odometry_trials": {"camera", "frames", "poses", "odometry", "track", "virtual_camera", "virtual_steps"},
-    "odometry_tables": {"odometry", "odometry_trials"},
-    "odometry_plots": {"odometry_trials", "odometry_tables"},
-    "odometry_accuracy": {
-        "virtual_camera",
-        "virtual_steps",
-        "odometry_trials",
-        "odometry_tables",
-        "odometry_plots",
-        "tables",
-        "cli",
-    },
-    "settings": set(),
-    "config": BASE | {"camera", "settings", "paths"},
-    "template": {"camera", "settings", "config"},
-    "frames": {"errors", "camera"},
-    "track": {"camera", "frames", "odometry", "poses"},
-    "track_table": {"crs", "errors", "poses", "track"},
-    "drive": BASE | {"camera", "evaluate", "frames", "odometry", "poses", "track", "track_table", "vector"},
-    "paths": set(),
-    "store": {"errors", "paths"},
-    "recipe": CHAIN,
-    "notices": CHAIN,
-    "geoid": {"crs"},
-    "globe": {"crs", "geoid", "mesh"},
-    "mesh_files": {"crs", "errors", "mesh"},
-    "product": CHAIN | {"project", "style", "globe"},
-    "neighbours": {"row_frame"},
-    "lanes": {"neighbours", "row_frame"},
-    "export": set(),
-    "export.field": BASE | {"paths", "lanes"},
-    **{f"export.{name}": {"errors", "paths", "lanes", "export.field"} for name in GUIDANCE},
-    "export.meshes": {"crs", "mesh", "mesh_files", "paths", "export.field"},
-    "export.gazebo": {"crs", "errors", "mesh", "mesh_files", "paths", "export.field", "export.meshes"},
-    "export.write": {"errors", "paths", "store", "export"}
-    | {f"export.{name}" for name in (*GUIDANCE, "field", "meshes", "gazebo")},
-    "page": {"paths", "json_values"},
-    "report": {"page", "raster"},
-    "changes": {"evaluate"},
-    "index": BASE | {"paths", "store", "page", "changes"},
-    "stac": CHAIN | {"store"},
-    "parcel": CHAIN | {"product", "recipe", "notices", "report", "store", "stac"},
-    "workers": BASE,
-    "dask_engine": BASE | {"workers"},
-    "plan": CHAIN | {"parcel", "recipe", "store"},
-    "survey": CHAIN | {"globe", "index", "parcel", "plan", "recipe", "stac", "store", "workers", "dask_engine"},
-    "estate": CHAIN,
-    "canopy_accuracy": CHAIN | {"parcel"},
-    "accuracy": CHAIN | {"parcel", "canopy_accuracy", "tables"},
-    "bench_jobs": CHAIN | {"parcel"},
-    "bench": {"errors", "paths", "tables", "processes", "cli"},
-    "tune": CHAIN | {"parcel", "cli"},
-    "picture": {"paths", "style", "mesh_files"},
-    "cli": CHAIN | {"drive", "parcel", "plan", "survey", "template", "export", "export.write"},
-    "__main__": {"cli"},
-    "flows": CHAIN | {"drive", "parcel", "recipe", "plan", "survey", "estate", "processes", "cli", "flows"},
-}
+"""Steps of the chain: what two of them need lies in a file of its own."""
+ONLY_IN = {"prefect": "flows", "distributed": "jobs", "dask": "jobs", "pdal": "cloud"}
+"""Libraries that one room alone imports."""
+NAMERS = {"paths", "simulate", "measure"}
+"""Rooms that write names of files: `paths`, and tools of development."""
+MOST_LINES, MOST_FILES = 350, 12
+FILE = re.compile(
+    r"[\w{}.-]*\.(csv|geojson|glb|gpkg|html|json|las|laz|obj|ply|png|qgs|qgz|qml|sdf|shp|tif|xml|xyz|yaml)"
+)
 
 
-def imports(source, package):
-    """Return the dotted names that a module imports anywhere in it, for type checking as well."""
+def modules():
+    """Dotted names of all modules, with their files."""
+    found = {}
+    for path in sorted([*ROOT.glob("vinemap/**/*.py"), *ROOT.glob("flows/**/*.py")]):
+        if "node_modules" not in path.parts:
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def room_of(name):
+    """Room of a dotted name of ours; None of others', and of the door, ``vinemap`` itself."""
+    top, _, rest = name.partition(".")
+    if top == "flows":
+        return "flows"
+    return rest.partition(".")[0] or None if top == "vinemap" else None
+
+
+def imports(source, package=""):
+    """Dotted names that a module imports anywhere in it, for type checking as well; of a module its own name alone."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -139,89 +81,186 @@ def imports(source, package):
         elif isinstance(node, ast.ImportFrom):
             origin = ".".join(filter(None, [package if node.level else "", node.module]))
             names |= {f"{origin}.{alias.name}" for alias in node.names}
-    return names
+    return {
+        name if name in MODULES or name.rpartition(".")[0] not in MODULES else name.rpartition(".")[0] for name in names
+    }
 
 
-def name_of(path):
-    """What a module goes by in the rule: its own name, after that of its package inside of vinemap ("export.nav2")."""
-    _, *rooms, _ = path.relative_to(ROOT).parts
-    return ".".join(rooms if rooms and path.stem == "__init__" else [*rooms, path.stem])
-
-
-def breaches(source, package, module):
-    """Return what a module imports against the rule; a module is what its name or its flow's package stands for."""
-    me = "flows" if package == "flows" else module
-    if me not in MAY_IMPORT:
-        return [f"{module}: give it a place in tests/test_house.py"]
-    wrong = []
-    for name in sorted(imports(source, package)):
-        top, _, rest = name.partition(".")
-        if top == "flows":
-            other = "flows"
-        elif top == "vinemap":
-            room, *doors = rest.split(".")
-            other = ".".join([room, *doors[:1]])
-            other = other if other in MAY_IMPORT else room
-        else:
-            other = top if top == "prefect" else ""
-        ours = other in MAY_IMPORT or other == "prefect"
-        if ours and other != me and other not in MAY_IMPORT[me] | ({"prefect"} if me == "flows" else set()):
-            wrong.append(f"{module} imports {other}")
+def breaches(source, name):
+    """What a module imports against the rules."""
+    mine, wrong = room_of(name), []
+    for other in sorted(imports(source, name.rpartition(".")[0]) - {name, "vinemap", "vinemap.__version__"}):
+        room, stage = room_of(other), other.rpartition(".")[2]
+        below = room is not None and (room not in ROOMS or ROOMS.index(room) > ROOMS.index(mine))
+        aside = room == mine and {stage, name.rpartition(".")[2]} <= STAGES.get(mine, set())
+        elsewhere = mine != ONLY_IN.get(other.partition(".")[0], mine)
+        if below or aside or elsewhere:
+            wrong.append(f"{name} imports {other}")
     return wrong
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_one_way(path):
-    assert breaches(path.read_text(encoding="utf-8"), path.relative_to(ROOT).parts[0], name_of(path)) == []
+def test_every_room_has_its_place_in_the_order():
+    assert {room_of(name) for name in MODULES} - {None} == set(ROOMS)
+    assert set(STAGES) <= set(ROOMS)
+    assert {f"vinemap.{room}.{stage}" for room, stages in STAGES.items() for stage in stages} <= set(MODULES)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_go_one_way(name):
+    if name != "vinemap":  # the door offers what lies in all rooms
+        assert breaches(MODULES[name].read_text(encoding="utf-8"), name) == []
 
 
 @pytest.mark.parametrize(
-    ("source", "module", "wrong"),
+    ("source", "name", "wrong"),
     [
-        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "ground", []),
-        ("from vinemap.cloud.points import PointCloud", "evaluate", []),
-        ("from vinemap.rows.key_points import find", "curves", ["key_points"]),
-        ("from vinemap import curves, raster", "key_points", ["curves"]),
-        ("import vinemap.parcel", "ground", ["parcel"]),
-        ("from . import cloud", "errors", ["cloud"]),
-        ("from .vector import write", "crs", ["vector"]),
-        ("if TYPE_CHECKING:\n    from vinemap.rows.field import RowField", "mesh", ["row_field"]),
-        ("def f():\n    from vinemap.config.surveys import Config", "curves", ["config"]),
-        ("from vinemap.config.surveys import Config\nfrom vinemap import paths", "parcel", []),
-        ("from vinemap.parcel import follow", "config", ["parcel"]),
-        ("from vinemap.geo.raster import Raster", "synthetic", ["raster"]),
-        ("from vinemap.simulate.scenes import rows_of", "synthetic", ["scenes"]),
-        ("from vinemap.simulate.survey import simulate", "scenes", []),
-        ("from prefect import task", "parcel", ["prefect"]),
-        ("import prefect.futures", "cli", ["prefect"]),
-        ("from flows.parcel import map_parcel", "cli", ["flows"]),
-        ("from vinemap.cli.main import main", "parcel", ["cli"]),
+        ("import numpy\nfrom vinemap.errors import InputError\nfrom vinemap import __version__", "rows.field", []),
+        ("from vinemap.cloud.points import PointCloud", "evaluate.rows", []),
+        ("from vinemap.canopy.hull import cross", "canopy.cgon", []),
+        ("from vinemap.rows.key_points import find", "rows.curves", ["vinemap.rows.key_points"]),
+        ("from vinemap.rows import curves, centre_line", "rows.key_points", ["vinemap.rows.curves"]),
+        ("import vinemap.parcel", "surfaces.ground", ["vinemap.parcel"]),
+        ("from . import cloud", "errors", ["vinemap.cloud"]),
+        ("from ..product import store", "geo.crs", ["vinemap.product.store"]),
+        ("if TYPE_CHECKING:\n    from vinemap.rows.field import x", "geo.raster", ["vinemap.rows.field"]),
+        ("def f():\n    from vinemap.product.recipe import Recipe", "config.surveys", ["vinemap.product.recipe"]),
+        ("from vinemap.config.surveys import x\nfrom vinemap import paths", "parcel", []),
+        ("from vinemap.nowhere import x", "measure.tune", ["vinemap.nowhere.x"]),
+        ("from prefect import task", "parcel", ["prefect.task"]),
+        ("import prefect.futures", "cli.run", ["prefect.futures"]),
+        ("from dask import delayed", "parcel", ["dask.delayed"]),
+        ("from flows.parcel import as_tasks", "cli.run", ["flows.parcel"]),
+        ("from vinemap.cli.main import main", "parcel", ["vinemap.cli.main"]),
         ("from vinemap.export.nav2 import write_nav2", "export.write", []),
-        ("from vinemap.export.nav2 import write_nav2", "export.isoxml", ["export.nav2"]),
-        ("from vinemap.export import nav2", "lanes", ["export.nav2"]),
-        ("from vinemap.product.store import product", "export.nav2", ["store"]),
     ],
 )
-def test_the_rule_sees_a_breach(source, module, wrong):
-    assert breaches(source, "vinemap", module) == [f"{module} imports {other}" for other in wrong]
+def test_the_rule_sees_a_breach(source, name, wrong):
+    source = source.replace("from ..product", "from vinemap.product")
+    assert breaches(source, f"vinemap.{name}") == [f"vinemap.{name} imports {other}" for other in wrong]
 
 
-def test_flows_are_the_only_place_for_prefect():
-    assert breaches("from prefect import flow\nfrom vinemap.parcel import map_parcel", "flows", "parcel") == []
+def test_flows_may_use_all_rooms_and_prefect():
+    assert breaches("from prefect import flow\nfrom vinemap.parcel import map_parcel", "flows.parcel") == []
 
 
-def test_a_new_module_needs_a_place():
-    assert "give it a place" in breaches("", "vinemap", "gadgets")[0]
+def test_no_two_modules_need_each_other():
+    graph = {
+        name: imports(path.read_text(encoding="utf-8"), name.rpartition(".")[0]) & set(MODULES) - {name, "vinemap"}
+        for name, path in MODULES.items()
+        if name != "vinemap"
+    }
+    graphlib.TopologicalSorter(graph).prepare()
 
 
-def test_every_room_has_a_purpose_in_its_name():
-    assert [path for path in MODULES if re.fullmatch(r"_*(utils?|helpers?|misc|common)", path.stem)] == []
+def names_of_files(source):
+    """Texts that are the name of a file, or end as one."""
+    tree = ast.parse(source)
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
+        if FILE.fullmatch(node.value) and not node.value.startswith(("vinemap.", "."))
+    ]
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if room_of(name) not in NAMERS])
+def test_names_of_files_are_written_in_paths(name):
+    assert names_of_files(MODULES[name].read_text(encoding="utf-8")) == []
+
+
+def test_the_rule_sees_a_name():
+    assert names_of_files('"""a.json"""\nx = folder / "run.json"\ny = f"{name}_dtm.tif"\nz = "a sentence. json"') == [
+        "run.json",
+        "_dtm.tif",
+    ]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_files_hold_one_idea(name):
+    """A longer one says in its first lines why it is so long."""
+    source = MODULES[name].read_text(encoding="utf-8")
+    assert source.count("\n") <= MOST_LINES or "lines" in (ast.get_docstring(ast.parse(source)) or "")
+
+
+def test_rooms_are_small_and_say_what_belongs_there():
+    folders = {path.parent for path in MODULES.values()} - {ROOT / "vinemap"}
+    crowded = {f.name: n for f in folders if (n := len({*f.glob("*.py")} - {f / "__init__.py"})) > MOST_FILES}
+    assert crowded == {}
+    for folder in folders:
+        assert len(ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))) > 40, folder
+
+
+def test_names_dont_repeat_their_room():
+    repeated = [
+        n for n in MODULES if n.count(".") > 1 and n.rpartition(".")[2].startswith(n.split(".")[-2].rstrip("s") + "_")
+    ]
+    assert repeated == []
+
+
+def test_every_file_has_a_purpose_in_its_name():
+    assert [path for path in MODULES.values() if re.fullmatch(r"_*(utils?|helpers?|misc|common)", path.stem)] == []
+
+
+def test_tests_lie_in_folders_like_the_rooms():
+    folders = {path.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").glob("*/**/test_*.py")}
+    assert folders <= set(ROOMS)
+
+
+def compiled_names(source):
+    """Names that compiled functions of a module take from others of ours, with the modules they come from."""
+    tree = ast.parse(source)
+    ours = {
+        alias.asname or alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vinemap")
+        for alias in node.names
+    }
+    used = {
+        name.id
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef) and any(getattr(d, "id", "") == "compiled" for d in node.decorator_list)
+        for part in node.body
+        for name in ast.walk(part)
+        if isinstance(name, ast.Name)
+    }
+    return {(name, ours[name]) for name in used & set(ours)}
+
+
+@pytest.mark.parametrize("name", [name for name, path in MODULES.items() if "@compiled" in path.read_text("utf-8")])
+def test_compiled_functions_take_nothing_from_files_that_their_cache_ignores(name):
+    """The cache is of a hash of all files with compiled functions, one folder deep."""
+    assert name.count(".") == 2
+    for used, module in compiled_names(MODULES[name].read_text(encoding="utf-8")):
+        assert "@compiled" in MODULES[module].read_text(encoding="utf-8"), f"{name} takes {used} from {module}"
 
 
 def test_the_command_line_starts_without_heavy_libraries():
     code = "import json, sys, vinemap.cli.main; print(json.dumps(sorted(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert {"prefect", "open3d", "geopandas", "rasterio"} & set(json.loads(run.stdout)) == set()
+    heavy = {"prefect", "open3d", "geopandas", "rasterio", "numpy", "pydantic", "numba", "cv2"}
+    assert heavy & set(json.loads(run.stdout)) == set()
+
+
+def test_the_library_is_light_until_it_is_used():
+    code = (
+        "import json, sys, vinemap; before = sorted(sys.modules)\n"
+        "assert set(vinemap.__all__) <= set(dir(vinemap))\n"
+        "assert all(callable(getattr(vinemap, name)) for name in vinemap.__all__)\n"
+        "print(json.dumps([before, sorted(sys.modules)]))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    before, after = map(set, json.loads(run.stdout))
+    assert {name.partition(".")[0] for name in before} & {"numpy", "click", "pydantic"} == set()
+    assert "vinemap.parcel" in after
+    assert {"prefect", "open3d"} & after == set()
+
+
+def test_what_the_library_does_not_offer_is_told():
+    import vinemap
+
+    with pytest.raises(AttributeError, match="no attribute 'map_row'"):
+        _ = vinemap.map_row
 
 
 def constraints():

@@ -9,8 +9,6 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-import numpy as np
-
 from vinemap import paths
 from vinemap.canopy.classification import classify_points
 from vinemap.canopy.foliage import living_canopies, separate_canopy
@@ -26,8 +24,6 @@ from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.config.names import check_name
 from vinemap.config.settings import Settings
-from vinemap.errors import InputError
-from vinemap.geo.crs import Origin, to_main, to_wgs84
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.pages.parcel import write_page
@@ -43,7 +39,7 @@ from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
 from vinemap.rows.missing import count_missing
-from vinemap.rows.numbers import describe_rows, number_rows
+from vinemap.rows.numbers import check_near, corner_of, describe_rows, number_rows
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
@@ -60,14 +56,13 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
+    from vinemap.geo.crs import Origin
     from vinemap.geo.raster import Raster, RowField
 
 T = TypeVar("T")
 
 BYTES_A_POINT = 60
-"""Memory that a run takes."""
-FARTHEST = 50_000.0
-"""Metres from the origin of {Main}, a plane that the globe leaves by then."""
+"""Memory that a run takes: half of the machine's is for it."""
 
 STAGES = (
     "Reading",
@@ -256,14 +251,12 @@ def follow(
 
     with store.product(folder, drafts=drafts, within=within) as draft:
         points = _read(recipe, piece, draft, run)
-        if origin and np.abs(to_main(points.extent[0][None], points.crs, origin)[0, :2]).max() > FARTHEST:
-            raise InputError(
-                f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first"
-            )
+        if origin:
+            check_near(origin, points.extent[0], points.crs)
         seen = map_rows(points, settings, step=run)
         rows, gaps = seen.rows, seen.gaps
         model = model_canopies(seen, settings, step=run)
-        origin = origin or _corner(seen.dtm)
+        origin = origin or corner_of(seen.dtm)
         rows, ends, enhanced = describe_rows(
             summarise_rows(rows, model.table, step=settings.sections.step),
             parcel=parcel,
@@ -308,7 +301,7 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., A
     settings = recipe.settings
     collector = Collector(
         paths.tiles(draft),
-        most=settings.reading.max_points or _most_points(),
+        most=settings.reading.max_points or machine.memory() // 2 // BYTES_A_POINT,
         block=block_side(settings.ground.resolution),
     )
     points: Cloud
@@ -353,16 +346,3 @@ def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
     options = settings.sections
     dense = options.model_copy(update={"step": min(options.step, options.width)})
     return [canopy.sections for canopy in find_canopies(found, settings.model_copy(update={"sections": dense}))]
-
-
-def _most_points() -> int:
-    """Points that half of the memory holds."""
-    return machine.memory() // 2 // BYTES_A_POINT
-
-
-def _corner(dtm: Raster) -> Origin:
-    """Origin of {Main} at the south-western corner of a raster, at its lowest elevation."""
-    grid = dtm.grid
-    south = grid.north - grid.ny * grid.resolution
-    lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
-    return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.canopy.hull import as_complex, as_pairs, checked_start, order_of, ring_of
-from vinemap.canopy.peeling import packed
+from vinemap.canopy.hull import as_complex, as_pairs, checked_start, order_of, packed, ring_of
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 

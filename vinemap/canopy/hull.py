@@ -142,3 +142,9 @@ def shared_area(polygon: Points, convex: Points) -> float:
         if size < 3:
             return 0.0
     return area_of(inside)
+
+
+def packed(points: Points, at: Ints, size: Ints) -> tuple[Floats, Ints]:
+    """Points (k, 2) that were written with room between them, ``size`` of them from each place on, and their starts."""
+    start = np.concatenate([[0], np.cumsum(size)])
+    return as_pairs(points[np.arange(start[-1]) + np.repeat(at - start[:-1], size)]), start

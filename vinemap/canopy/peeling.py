@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.hull import append_to, area_of, as_complex, as_pairs, checked_start, cross, order_of, ring_of
+from vinemap.canopy.hull import (
+    append_to,
+    area_of,
+    as_complex,
+    checked_start,
+    cross,
+    order_of,
+    packed,
+    ring_of,
+)
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -59,12 +68,6 @@ def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -
     hulls, size = np.empty(len(section), dtype=np.complex128), np.zeros(m, dtype=np.int64)
     in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, hulls, size), stretches(m))
     return Peeled(kept, area, perimeter, *packed(hulls, offsets[:-1], size))
-
-
-def packed(points: Points, at: Ints, size: Ints) -> tuple[Floats, Ints]:
-    """Points (k, 2) that were written with room between them, ``size`` of them from each place on, and their starts."""
-    start = np.concatenate([[0], np.cumsum(size)])
-    return as_pairs(points[np.arange(start[-1]) + np.repeat(at - start[:-1], size)]), start
 
 
 def peel(points: ArrayLike, count: int) -> Ints:

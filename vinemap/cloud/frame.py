@@ -10,7 +10,7 @@ import shapely
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import at, tangents, way_along
-from vinemap.geo.raster import grid_over
+from vinemap.geo.raster import cell_at, grid_over
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -168,13 +168,10 @@ def _find_guides(
     """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach; points of each row."""
     grid, nearest, guides = lookup
     n = np.zeros(len(reach), dtype=np.int64)
-    scale = 1 / grid.resolution
     for p in range(first, last):
         guide[p] = -1
-        j, i = (xyz[p, 0] - grid.west) * scale, (grid.north - xyz[p, 1]) * scale
-        if j < 0 or i < 0 or j >= grid.nx or i >= grid.ny:
-            continue
-        g = nearest[int(i), int(j)]
+        i, j = cell_at(grid, xyz[p, 0], xyz[p, 1])
+        g = nearest[i, j] if 0 <= i < grid.ny and 0 <= j < grid.nx else -1
         if g < 0:
             continue
         x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]

@@ -9,7 +9,7 @@ import shapely
 from scipy.ndimage import binary_dilation
 
 from vinemap.compute.compiled import compiled
-from vinemap.geo.raster import Grid, window
+from vinemap.geo.raster import Grid, cell_at, window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -99,9 +99,8 @@ def _ask(xyz: Points, polygons: Sequence[shapely.Geometry]) -> tuple[Indices, La
 @compiled
 def _look_up(xyz: Points, grid: Grid, code: Labels, label: Labels) -> None:
     for p in range(len(xyz)):
-        j, i = (xyz[p, 0] - grid.west) / grid.resolution, (grid.north - xyz[p, 1]) / grid.resolution
-        inside = 0 <= j < grid.nx and 0 <= i < grid.ny
-        label[p] = code[int(i), int(j)] if inside else NOWHERE
+        i, j = cell_at(grid, xyz[p, 0], xyz[p, 1])
+        label[p] = code[i, j] if 0 <= i < grid.ny and 0 <= j < grid.nx else NOWHERE
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -200,11 +201,23 @@ def _bounds(first: int, last: int, points: NDArray[np.float64]) -> NDArray[np.fl
 
 
 @compiled
-def _cells(first: int, last: int, xy: NDArray[np.float64], grid: Grid, out: NDArray[np.int32]) -> None:
+def cell_at(grid: Grid, x: float, y: float) -> tuple[int, int]:
+    """Row and column of the cell that holds a point; beyond the grid's edges they go on."""
     scale = 1 / grid.resolution
+    return math.floor((grid.north - y) * scale), math.floor((x - grid.west) * scale)
+
+
+@compiled
+def nearest_cell(grid: Grid, x: float, y: float) -> tuple[int, int]:
+    """Row and column of the grid's cell that holds a point or is nearest to it."""
+    i, j = cell_at(grid, x, y)
+    return min(max(i, 0), grid.ny - 1), min(max(j, 0), grid.nx - 1)
+
+
+@compiled
+def _cells(first: int, last: int, xy: NDArray[np.float64], grid: Grid, out: NDArray[np.int32]) -> None:
     for p in range(first, last):
-        j = min(max(int((xy[p, 0] - grid.west) * scale), 0), grid.nx - 1)
-        i = min(max(int((grid.north - xy[p, 1]) * scale), 0), grid.ny - 1)
+        i, j = nearest_cell(grid, xy[p, 0], xy[p, 1])
         out[p] = i * grid.nx + j
 
 

@@ -18,6 +18,8 @@ TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""
 SLOPE = 1.0
 """Cutoff of a detail's slopes, in cutoffs of its bends."""
+CELL = 0.05
+"""Metres of a cell of a straightened row, along and across."""
 
 
 def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:

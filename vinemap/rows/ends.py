@@ -8,8 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from vinemap.geo.curve import between, way_along
-from vinemap.rows.centre_line import runs_above
-from vinemap.rows.fit import CELL
+from vinemap.rows.centre_line import CELL, runs_above
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -21,8 +21,8 @@ from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, normals, resample, way_along
-from vinemap.geo.raster import Raster, sample
-from vinemap.rows.centre_line import centre_line, half_width
+from vinemap.geo.raster import Raster, nearest_cell, sample
+from vinemap.rows.centre_line import CELL, centre_line, half_width
 from vinemap.rows.ends import Fit, find_ends
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.floating]
 
-CELL = 0.05
-"""Metres of a cell of a straightened row, along and across."""
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
 COURSE = 20.0
@@ -195,8 +193,7 @@ def _weigh(
     low, high = limits
     for k in range(first, last):
         p = member[k]
-        j = min(max(int((xyz[p, 0] - grid.west) / grid.resolution), 0), grid.nx - 1)
-        i = min(max(int((grid.north - xyz[p, 1]) / grid.resolution), 0), grid.ny - 1)
+        i, j = nearest_cell(grid, xyz[p, 0], xyz[p, 1])
         if vines[i, j]:
             rise = min(max((heights[p] - low) / RAMP + 0.5, 0.0), 1.0)
             canopy[k] = rise * min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vinemap.measure.accuracy.rows import mean, quantile
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-
-    from numpy.typing import ArrayLike
 
     from vinemap.measure.accuracy.canopies import CanopyErrors
     from vinemap.measure.accuracy.rows import Errors
@@ -22,6 +22,10 @@ EASED = {
     ("terraces", "DTM m", "95%"): 0.20,
     ("sparse", "width m", "worst row"): 0.10,
 }
+EASED |= {(family, TRUE_FOLIAGE, "G"): 0.85 for family in ("thin", "sparse")}
+EASED |= {(family, TRUE_FOLIAGE, "U"): 0.15 for family in ("thin", "sparse")}
+EASED |= {(family, TRUE_FOLIAGE, "G − U − O"): 0.55 for family in ("thin", "sparse")}
+"""Bars that are lower for a family."""
 
 
 class Measure(NamedTuple):
@@ -32,16 +36,6 @@ class Measure(NamedTuple):
     bar: float
     digits: int = 3
     at_least: bool = False
-
-
-def mean(values: ArrayLike) -> float:
-    """Mean, NaN of nothing."""
-    return float(np.mean(np.asarray(values, dtype=float))) if np.size(values) else np.nan
-
-
-def quantile(values: ArrayLike, order: float) -> float:
-    """Quantile, NaN of nothing."""
-    return float(np.quantile(np.asarray(values, dtype=float), order)) if np.size(values) else np.nan
 
 
 Columns = dict[str, dict[str, Measure]]

@@ -10,13 +10,12 @@ import shapely
 
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.geo.raster import Raster, RowField, cell_of, sample
-from vinemap.measure.accuracy.figures import EASED, TRUE_FOLIAGE, quantile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import geopandas as gpd
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from vinemap.parcel import RowMap
     from vinemap.simulate.survey import Survey
@@ -57,18 +56,6 @@ class Worst(NamedTuple):
     badness: float
     line: shapely.LineString
     what: str
-
-
-EASED |= {(family, TRUE_FOLIAGE, "G"): 0.85 for family in ("thin", "sparse")}
-
-
-EASED |= {(family, TRUE_FOLIAGE, "U"): 0.15 for family in ("thin", "sparse")}
-
-
-EASED |= {(family, TRUE_FOLIAGE, "G − U − O"): 0.55 for family in ("thin", "sparse")}
-
-
-"""Bars that are lower for a family."""
 
 
 def compare(survey: Survey, found: RowMap) -> tuple[Errors, Worst | None]:
@@ -168,3 +155,13 @@ def _gap_errors(survey: Survey, gaps: gpd.GeoDataFrame) -> tuple[NDArray[np.bool
         if len(by):
             errors.append(abs(shapely.length(by).max() - true.length))
     return recalled, right, np.array(errors)
+
+
+def mean(values: ArrayLike) -> float:
+    """Mean, NaN of nothing."""
+    return float(np.mean(np.asarray(values, dtype=float))) if np.size(values) else np.nan
+
+
+def quantile(values: ArrayLike, order: float) -> float:
+    """Quantile, NaN of nothing."""
+    return float(np.quantile(np.asarray(values, dtype=float), order)) if np.size(values) else np.nan
