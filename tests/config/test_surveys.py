@@ -96,31 +96,35 @@ def test_defaults_of_settings_are_those_of_the_stages():
     """A stage called without options works as one called with the default settings."""
     import inspect
 
-    from vinemap.canopy import foliage as canopy
-    from vinemap.canopy import sections
-    from vinemap.rows import clusters as clustering
-    from vinemap.rows import curves, key_points
-    from vinemap.rows import field as row_field
-    from vinemap.rows import fit as row_fit
-    from vinemap.surfaces import cover, ground
+    from vinemap.canopy.foliage import living_canopies, separate_canopy
+    from vinemap.canopy.model import model_sections
+    from vinemap.canopy.sections import cut_sections
+    from vinemap.rows.clusters import cluster_rows
+    from vinemap.rows.curves import trace_rows
+    from vinemap.rows.field import estimate_row_field
+    from vinemap.rows.fit import fit_rows
+    from vinemap.rows.key_points import detect_key_points
+    from vinemap.surfaces.cover import canopy_cover
+    from vinemap.surfaces.ground import terrain_model
 
     stages = {
-        "ground": ground.terrain_model,
-        "cover": cover.canopy_cover,
-        "row_field": row_field.estimate_row_field,
-        "key_points": key_points.detect_key_points,
-        "clustering": clustering.cluster_rows,
-        "curves": curves.trace_rows,
-        "fit": row_fit.fit_rows,
-        "sections": sections.cut_sections,
-        "canopy": [canopy.separate_canopy, canopy.living_canopies],
+        "ground": [terrain_model],
+        "cover": [canopy_cover],
+        "row_field": [estimate_row_field],
+        "key_points": [detect_key_points],
+        "clustering": [cluster_rows],
+        "curves": [trace_rows],
+        "fit": [fit_rows],
+        "sections": [cut_sections],
+        "canopy": [separate_canopy, living_canopies],
+        "polygon": [model_sections],
     }
+    others = Settings().cover.model_dump() | Settings().canopy.model_dump()
     for name, options in Settings().model_dump().items():
         if name in stages:
-            functions = stages[name] if isinstance(stages[name], list) else [stages[name]]
-            parameters = [p for function in functions for p in inspect.signature(function).parameters.values()]
+            parameters = [p for function in stages[name] for p in inspect.signature(function).parameters.values()]
             defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
-            assert defaults == options | {k: Settings().cover.model_dump()[k] for k in defaults if k not in options}
+            assert defaults == options | {k: others[k] for k in defaults if k not in options}
 
 
 ODD = {

@@ -12,10 +12,16 @@ import pytest
 from click.testing import CliRunner
 
 from vinemap.compute import processes
+from vinemap.compute.processes import high_water
 from vinemap.errors import ConfigError, VinemapError
-from vinemap.measure.bench import jobs as bench_jobs
-from vinemap.measure.bench import runs as bench
-from vinemap.measure.bench.bars import Bar, Run
+from vinemap.measure.bench import runs
+from vinemap.measure.bench.__main__ import main, parse_sizes
+from vinemap.measure.bench.alternatives import course, memory_since
+from vinemap.measure.bench.bars import Bar, Run, bars, growth_exponent, growth_ratio, of_bar, span, with_other
+from vinemap.measure.bench.plot import draw
+from vinemap.measure.bench.runs import ensure_survey, instead, many, prefect
+from vinemap.measure.bench.surveys import plot
+from vinemap.measure.bench.tables import bar_table, figures, stage_table, write_tables
 
 SECONDS = {"Reading": 1.0, "DTM": 2.0, "Curves": 0.5, "Ends and gaps": 0.25, "Mesh": 0.0, "Writing": 1.0, "All": 5.0}
 
@@ -23,7 +29,7 @@ SECONDS = {"Reading": 1.0, "DTM": 2.0, "Curves": 0.5, "Ends and gaps": 0.25, "Me
 def run(millions, *, seconds=SECONDS, area=8200.0, reading=1.0, peak=500e6):
     peaks = dict.fromkeys(seconds, 400_000_000) | {"Mesh": None}
     wall = seconds["All"] + 1.5
-    return Run(int(1e6 * millions), area, reading, 300_000_000, wall, int(peak), bench.with_other(seconds), peaks)
+    return Run(int(1e6 * millions), area, reading, 300_000_000, wall, int(peak), with_other(seconds), peaks)
 
 
 def grown(millions, exponent):
@@ -31,22 +37,22 @@ def grown(millions, exponent):
 
 
 def test_what_lies_between_stages_is_other():
-    seconds = bench.with_other(SECONDS)
+    seconds = with_other(SECONDS)
     assert seconds["other"] == pytest.approx(0.25)
     assert list(seconds)[-2:] == ["other", "All"]
-    assert bench.with_other(SECONDS | {"All": 4.7})["other"] == 0
+    assert with_other(SECONDS | {"All": 4.7})["other"] == 0
 
 
 def test_stages_from_one_to_another():
-    assert bench.span(SECONDS, "DTM", "Ends and gaps") == 2.75
-    assert bench.span(SECONDS, "DTM", "DTM") == 2.0
+    assert span(SECONDS, "DTM", "Ends and gaps") == 2.75
+    assert span(SECONDS, "DTM", "DTM") == 2.0
 
 
 @pytest.mark.parametrize("exponent", [0.8, 1.0, 1.3])
 def test_growth(exponent):
     runs = [grown(millions, exponent) for millions in (1, 2, 4, 16)]
-    assert bench.growth_exponent([r.points for r in runs], [r.seconds["All"] for r in runs]) == pytest.approx(exponent)
-    assert bench.growth_ratio(runs) == pytest.approx(8 ** (exponent - 1))
+    assert growth_exponent([r.points for r in runs], [r.seconds["All"] for r in runs]) == pytest.approx(exponent)
+    assert growth_ratio(runs) == pytest.approx(8 ** (exponent - 1))
 
 
 def test_memory_of_processes_is_summed():
@@ -62,30 +68,30 @@ def test_memory_of_processes_is_summed():
 
 
 def test_a_survey_of_many_parcels(tmp_path):
-    (heading, line) = bench.many(0.15, 3, tmp_path)
+    (heading, line) = many(0.15, 3, tmp_path)
     assert line[0] == "0.2 M points, 3 parcels"
     assert len(list((tmp_path / "products").glob("estate-*/*/run.json"))) == 3
     assert len(heading) == len(line)
 
 
 def test_one_size_has_no_growth():
-    assert math.isnan(bench.growth_exponent([1e6], [2.0]))
-    assert math.isnan(bench.growth_ratio([run(1)]))
-    assert math.isnan(bench.growth_ratio([run(1), run(2)]))
-    assert bench.bar_table([run(1)])[-1][-1] == "–"
+    assert math.isnan(growth_exponent([1e6], [2.0]))
+    assert math.isnan(growth_ratio([run(1)]))
+    assert math.isnan(growth_ratio([run(1), run(2)]))
+    assert bar_table([run(1)])[-1][-1] == "–"
 
 
 def test_bars_of_small_and_large_parcels():
-    assert [bar.most for bar in bench.bars(run(2.9))] == [2, 4, 2, pytest.approx(574)]
-    large = bench.bars(run(4, area=20_000, reading=3))
+    assert [bar.most for bar in bars(run(2.9))] == [2, 4, 2, pytest.approx(574)]
+    large = bars(run(4, area=20_000, reading=3))
     assert [bar.most for bar in large] == [5, 10, 2, pytest.approx(640)]
     assert [bar.value for bar in large] == [2.75, 5, 1.5, 500]
 
 
 def test_a_missed_bar_is_marked():
-    assert bench.of_bar(Bar("", "", 2.004, 2.0)) == "2.00 of 2.00"
-    assert bench.of_bar(Bar("", "", 2.006, 2.0)) == "2.01 of 2.00!"
-    table = bench.bar_table([run(2), run(16, peak=2e9)])
+    assert of_bar(Bar("", "", 2.004, 2.0)) == "2.00 of 2.00"
+    assert of_bar(Bar("", "", 2.006, 2.0)) == "2.01 of 2.00!"
+    table = bar_table([run(2), run(16, peak=2e9)])
     assert [line[2:] for line in table[:2]] == [
         ["2.0 M points, 0.82 ha", "16.0 M points, 0.82 ha"],
         ["2.75 of 2.00!", "2.75 of 1.82!"],
@@ -97,10 +103,10 @@ def test_a_missed_bar_is_marked():
 
 def test_figures_of_a_stage():
     one = run(2, reading=0.5)
-    assert bench.figures(one, 0.25, 400_000_000) == "0.25, 8.0, 0.50, 200"
-    assert bench.figures(one, 0.0, None) == "0.00, –, 0.00, –"
-    assert bench.figures(one, None, None) == "–"
-    table = {line[0]: line[1:] for line in bench.stage_table([one, run(4)])}
+    assert figures(one, 0.25, 400_000_000) == "0.25, 8.0, 0.50, 200"
+    assert figures(one, 0.0, None) == "0.00, –, 0.00, –"
+    assert figures(one, None, None) == "–"
+    table = {line[0]: line[1:] for line in stage_table([one, run(4)])}
     assert table["laspy.read, xyz"] == ["0.50, 4.0, 1.00, 150", "1.00, 4.0, 1.00, 75"]
     assert table["DTM"] == ["2.00, 1.0, 4.00, 200", "2.00, 2.0, 2.00, 100"]
     assert table["Mesh"][0] == "0.00, –, 0.00, –"
@@ -109,10 +115,10 @@ def test_figures_of_a_stage():
 
 
 def test_sizes_are_numbers():
-    assert bench.parse_sizes("4 1, 0.5 4") == [0.5, 1, 4]
+    assert parse_sizes("4 1, 0.5 4") == [0.5, 1, 4]
     for text in ("", "one", "0 1", "-1", "nan", "inf"):
         with pytest.raises(ConfigError, match="million points"):
-            bench.parse_sizes(text)
+            parse_sizes(text)
 
 
 def test_processes_are_measured_and_stopped():
@@ -135,7 +141,7 @@ def test_the_document_is_filled(tmp_path):
     page = tmp_path / "speed.md"
     page.write_text("<!-- machine -->\n<!-- /machine -->\n<!-- bars -->\n<!-- /bars -->\nend", encoding="utf-8")
     for _ in range(2):
-        bench.write_tables({"bars": [["a"], ["1"]]}, page)
+        write_tables({"bars": [["a"], ["1"]]}, page)
     lines = page.read_text(encoding="utf-8").splitlines()
     assert lines[1].startswith("Measured on ")
     assert lines[3:] == ["<!-- bars -->", "| a |", "| --- |", "| 1 |", "<!-- /bars -->", "end"]
@@ -150,12 +156,12 @@ def test_the_page_has_a_place_for_every_table():
 def test_the_plot_is_small(tmp_path):
     stages = dict.fromkeys(["Reading", "DTM", "Canopy cover", "Curves", "Ends and gaps", "Sections", "Mesh"], 0.5)
     runs = [run(n, seconds={k: n * v for k, v in (stages | {"Writing": 0.5, "All": 4.5}).items()}) for n in (1, 2, 16)]
-    bench.draw(runs, tmp_path / "new" / "speed.png")
+    draw(runs, tmp_path / "new" / "speed.png")
     assert 0 < (tmp_path / "new" / "speed.png").stat().st_size < 150_000
 
 
 def test_parcels_grow_in_both_directions():
-    small, large = (bench_jobs.plot(millions).rows for millions in (1, 16))
+    small, large = (plot(millions).rows for millions in (1, 16))
     assert (len(small), len(large)) == (7, 30)
     lengths = [np.linalg.norm(np.diff(rows[len(rows) // 2], axis=0), axis=1).sum() for rows in (small, large)]
     assert 4.5 < lengths[1] / lengths[0] < 5.5
@@ -164,22 +170,22 @@ def test_parcels_grow_in_both_directions():
 def test_a_line_through_a_cluster():
     along = np.linspace(0, 20, 400)
     xy = np.column_stack([along, 0.005 * (along - 10) ** 2]) + [[400_000, 5_000_000]]
-    line = bench_jobs.course(xy)
+    line = course(xy)
     assert line.length == pytest.approx(20, abs=0.1)
     assert max(abs(y - 5_000_000 - 0.005 * (x - 400_010) ** 2) for x, y in line.coords[1:-1]) < 0.03
-    assert bench_jobs.course(xy[:10]) is None
+    assert course(xy[:10]) is None
 
 
 def test_memory_that_the_system_does_not_tell(tmp_path):
-    assert bench_jobs.high_water(status=tmp_path / "none") is None
-    assert bench_jobs.memory_since(None) == ""
+    assert high_water(status=tmp_path / "none") is None
+    assert memory_since(None) == ""
 
 
 def test_an_alternative_that_is_missing_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "ensure_survey", lambda *_: {})
-    monkeypatch.setattr(bench, "find_spec", lambda _: None)
-    stages = bench.with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
-    lines = bench.instead(1, run(1)._replace(seconds=stages), tmp_path)
+    monkeypatch.setattr(runs, "ensure_survey", lambda *_: {})
+    monkeypatch.setattr(runs, "find_spec", lambda _: None)
+    stages = with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
+    lines = instead(1, run(1)._replace(seconds=stages), tmp_path)
     assert [line[0] for line in lines[1:]] == ["ground", "rows", "rows, thinned", "c-gons"]
     assert all("pip install 'vinemap[bench]'" in line[1] for line in lines[1:])
     assert {len(line) for line in lines} == {6}
@@ -187,17 +193,17 @@ def test_an_alternative_that_is_missing_says_how_to_get_it(tmp_path, monkeypatch
 
 def test_an_alternative_that_fails_costs_nothing(tmp_path, monkeypatch):
     files = {"cloud": "none.laz", "boundary": "none.gpkg", "truth": "none.gpkg"}
-    monkeypatch.setattr(bench, "ensure_survey", lambda *_: files)
-    monkeypatch.setattr(bench, "find_spec", lambda module: module == "cv2" or None)
-    monkeypatch.setattr(bench, "run_process", lambda *_, **__: processes.Outcome(-9, 600.0, 1, "stopped after 600 s"))
-    stages = bench.with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
-    lines = bench.instead(1, run(1)._replace(seconds=stages), tmp_path)
+    monkeypatch.setattr(runs, "ensure_survey", lambda *_: files)
+    monkeypatch.setattr(runs, "find_spec", lambda module: module == "cv2" or None)
+    monkeypatch.setattr(runs, "run_process", lambda *_, **__: processes.Outcome(-9, 600.0, 1, "stopped after 600 s"))
+    stages = with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
+    lines = instead(1, run(1)._replace(seconds=stages), tmp_path)
     assert lines[-1] == ["c-gons", "cv2", "–", "stopped after 600 s", "–", "–"]
 
 
 def test_no_flow_without_its_configuration(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "start from the repository's folder" in bench.prefect(tmp_path)[1][0]
+    assert "start from the repository's folder" in prefect(tmp_path)[1][0]
 
 
 def test_a_small_benchmark(tmp_path):
@@ -213,7 +219,7 @@ def test_a_small_benchmark(tmp_path):
         "--without",
         "many",
     ]
-    done = CliRunner().invoke(bench.main, arguments, catch_exceptions=False)
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert done.exit_code == 0
     (cloud,) = (tmp_path / "surveys").glob("0.1M-*/0.1M-*.laz")
     (found,) = json.loads((tmp_path / "runs.json").read_text(encoding="utf-8"))
@@ -225,5 +231,5 @@ def test_a_small_benchmark(tmp_path):
     for module, tool in (("CSF", "cloth-simulation-filter "), ("sklearn", "DBSCAN of"), ("cv2", "approxPolyN of")):
         assert (tool if find_spec(module) else f"{module} isn't installed") in done.output
     before = cloud.stat().st_mtime_ns
-    assert bench.ensure_survey(0.1, tmp_path)["cloud"] == str(cloud)
+    assert ensure_survey(0.1, tmp_path)["cloud"] == str(cloud)
     assert cloud.stat().st_mtime_ns == before

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from vinemap.errors import InputError
-from vinemap.measure.odometry import main
+from vinemap.measure.odometry.__main__ import main
 from vinemap.measure.odometry.tables import drift_table, loss_table, mark, size_table, terrain_tables
 from vinemap.measure.odometry.trials import (
     FAILURE,

@@ -16,8 +16,8 @@ from systems import LINUX, POSIX
 
 from vinemap import paths
 from vinemap.config.names import check_name
-from vinemap.config.surveys import LONGEST_NAME, MOST_BYTES
 from vinemap.errors import BusyError, OutputError
+from vinemap.paths import LONGEST_NAME, MOST_BYTES
 from vinemap.product import store
 
 

@@ -11,10 +11,11 @@ import shapely
 from pyproj import CRS
 
 from vinemap.geo.crs import to_main
+from vinemap.paths import TABLE_2_1
 from vinemap.simulate.families import family
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
-from vinemap.simulate.scenes import TABLE_2_1, TABLE_2_1_ORIGIN, barolo, rows_of
+from vinemap.simulate.scenes import TABLE_2_1_ORIGIN, barolo, rows_of
 from vinemap.simulate.survey import simulate, write_survey
 from vinemap.simulate.terrain import PLACE, hillside, surface_through, terraced
 
