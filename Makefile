@@ -49,7 +49,7 @@ test: $(READY) ## Run the tests, two files at once
 	@$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis
-	@$(BIN)/python -m pytest -n 0 tests/test_qgis.py
+	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py
 
 check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check
@@ -57,13 +57,13 @@ check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m mypy
 
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
-	@$(BIN)/python -m vinemap.measure.accuracy.rows $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
+	@$(BIN)/python -m vinemap.measure.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
 
 odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=5000]
 	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.measure.odometry $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
-	@$(BIN)/python -m vinemap.measure.bench.runs $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
+	@$(BIN)/python -m vinemap.measure.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
 
 picture: $(READY) ## Draw README's picture of a product: make parcel PARCEL=curved picture
 	@$(BIN)/python -m vinemap.measure.picture data/products/barolo/$(or $(PARCEL),curved) $(or $(PARCEL),curved) docs/picture.png

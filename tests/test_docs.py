@@ -1,6 +1,7 @@
 """The documentation says what is so: its links, commands, columns and defaults."""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from vinemap.config.drives import load_camera, load_drives
 from vinemap.config.template import template
 from vinemap.odometry.layers import TRACK_LAYERS
 from vinemap.product.layers import LAYERS
+from vinemap.simulate.survey import write_survey
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -62,3 +64,32 @@ def test_the_camera_of_the_docs_is_one(tmp_path):
 
 def test_every_key_is_described():
     assert f"```yaml\n{template('survey')}```" in text("configuration.md"), "vinemap config survey has changed"
+
+
+def test_every_room_is_on_the_map():
+    section = re.search(r"## The house\n.*?\n## ", text("method.md"), re.DOTALL)[0]
+    there = {path.name for path in (ROOT / "vinemap").iterdir() if (path / "__init__.py").is_file()}
+    assert there <= set(re.findall(r"`(\w+)`", section))
+
+
+def test_files_that_tasks_open_exist():
+    section = re.search(r"\| to … \| open \|\n.*?\n\n", text("method.md"), re.DOTALL)[0]
+    files = re.findall(r"`((?:\w+/)*\w+\.(?:py|js))`", section)
+    assert len(files) > 15
+    assert [file for file in files if not (ROOT / "vinemap" / file).is_file()] == []
+
+
+def test_the_library_in_twenty_lines(tmp_path, monkeypatch, vineyard):
+    """What is printed on the page runs, on a small survey, and leaves a picture and a mesh."""
+    (code,) = re.findall(r"```python\n(.*?)```", text("library.md"), re.DOTALL)
+    assert len([line for line in code.splitlines() if line and not line.startswith(("import", "from"))]) <= 20
+    survey = tmp_path / "data" / "surveys" / "barolo"
+    cloud = write_survey(vineyard, survey)
+    shutil.move(cloud, survey / "barolo.laz")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names = {}
+    exec(code.replace('parcel="curved"', 'parcel="A"'), names)
+    assert len(names["rows"]) == len(vineyard.rows)
+    assert (tmp_path / "rows.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "canopies.glb").read_bytes().startswith(b"glTF")

@@ -164,7 +164,7 @@ def test_a_fault_in_the_page_costs_no_product(tmp_path, survey, product, monkeyp
     def faulty(*args):
         raise ZeroDivisionError("of the page")
 
-    monkeypatch.setattr("vinemap.parcel.parcel_page", faulty)
+    monkeypatch.setattr("vinemap.product.pages.parcel.parcel_page", faulty)
     summary = map_parcel(survey, tmp_path / "A", parcel="A", boundary=survey.parent / "parcels.gpkg")
     assert "it has no page: a fault of vinemap's own (ZeroDivisionError: of the page)" in summary.line()
     files = {path.name for path in product.folder.iterdir()} - {"A_report.html"}

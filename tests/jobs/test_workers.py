@@ -76,7 +76,7 @@ def test_calls_run_one_after_the_other_in_one_process(worker):
 
 def test_how_many_cores_it_takes():
     with Workers(1, cores=3) as one:
-        assert one.run(eval, "__import__('vinemap.compute.machine').machine.cores()") == 3
+        assert one.run(eval, "__import__('vinemap.compute.machine').compute.machine.cores()") == 3
 
 
 HANGS = {

@@ -205,7 +205,7 @@ def test_a_family_is_measured_and_drawn(tmp_path):
 
 def test_the_command():
     run = subprocess.run(
-        [sys.executable, "-m", "vinemap.measure.accuracy.rows", "short", "--seeds", "1", "--markdown"],
+        [sys.executable, "-m", "vinemap.measure.accuracy", "short", "--seeds", "1", "--markdown"],
         cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,

@@ -139,8 +139,8 @@ def photograph(tmp_path):
 
 
 def test_tables_plots_and_the_document_are_filled(tmp_path, photograph, monkeypatch):
-    monkeypatch.setattr("vinemap.measure.odometry.MADE", ())
-    monkeypatch.setattr("vinemap.measure.odometry.PHOTOGRAPHS", ("brick",))
+    monkeypatch.setattr("vinemap.measure.odometry.__main__.MADE", ())
+    monkeypatch.setattr("vinemap.measure.odometry.__main__.PHOTOGRAPHS", ("brick",))
     docs = tmp_path / "page.md"
     docs.write_text("<!-- places -->\n<!-- /places -->\n<!-- lost 5000 -->\nkept\n<!-- /lost 5000 -->\n", "utf-8")
     options = ["--steps", "2", "--pairs", "5", "--out", str(tmp_path / "plots"), "--docs", str(docs)]

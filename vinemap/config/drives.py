@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import Field
 
 from vinemap.config.camera import Camera
+from vinemap.config.names import Name
 from vinemap.config.settings import OdometryOptions, Options
 from vinemap.config.yaml_files import checked_by, read_yaml, validated
 from vinemap.geo.crs import Start, check_start
-
-if TYPE_CHECKING:
-    from vinemap.config.surveys import Name
 
 MapStart = Annotated[Start, checked_by(check_start)]
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from typing import Annotated
 
+from pydantic import AfterValidator
+
+from vinemap.config.yaml_files import checked_by
 from vinemap.errors import ConfigError
 from vinemap.paths import LONGEST_NAME, MOST_BYTES
 
@@ -33,3 +37,6 @@ def check_name(name: str) -> str:
     ):
         raise ConfigError(f"name {name!r} can't name a file: use letters, digits, spaces, '-' and '_', a letter first")
     return name
+
+
+Name = Annotated[str, AfterValidator(lambda name: unicodedata.normalize("NFC", name)), checked_by(check_name)]

@@ -6,15 +6,14 @@ import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
-from vinemap.config.names import check_name
+from vinemap.config.names import Name, check_name
 from vinemap.config.settings import Options, Settings
 from vinemap.config.yaml_files import checked_by, merge, nearest, read_yaml, validated
 from vinemap.errors import ConfigError
 from vinemap.geo.crs import Origin, check_origin, parse_crs
 
-Name = Annotated[str, AfterValidator(lambda name: unicodedata.normalize("NFC", name)), checked_by(check_name)]
 MainOrigin = Annotated[Origin, checked_by(check_origin)]
 
 
