@@ -29,10 +29,9 @@ from vinemap.compute.threads import in_threads, stretches
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.compute.arrays import Flags, Floats, Ints
+
     Points = NDArray[np.complex128]
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Flags = NDArray[np.bool_]
 
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""

@@ -9,11 +9,9 @@ import numpy as np
 from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vinemap.canopy.points import Sections
+    from vinemap.compute.arrays import Ints, Values
 
-    Values = NDArray[np.floating]
 
 FOOT_BIN = 0.025
 """Metres: bins of the histograms that tell the foliage's foot."""
@@ -54,14 +52,14 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     return canopy, feet
 
 
-def _window(canopy: Sections, reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _window(canopy: Sections, reach: float) -> tuple[Ints, Ints]:
     """First and last + 1 of the sections (m,) of the same row within reach of each."""
     row = np.unique(canopy.row_id, return_inverse=True)[1]
     key = row * (canopy.position.max() + 3 * reach) + canopy.position
     return np.searchsorted(key, key - reach), np.searchsorted(key, key + reach, side="right")
 
 
-def _pooled(histograms: Values, near: tuple[NDArray[np.int64], NDArray[np.int64]]) -> Values:
+def _pooled(histograms: Values, near: tuple[Ints, Ints]) -> Values:
     """Sums (m, bins) of the histograms of the sections in each one's window."""
     before = np.concatenate([np.zeros((1, histograms.shape[1])), np.cumsum(histograms, axis=0)])
     out: Values = before[near[1]] - before[near[0]]
@@ -69,7 +67,7 @@ def _pooled(histograms: Values, near: tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 @compiled
-def _histograms(values: Values, start: NDArray[np.int64], low: float, width: float, bins: int) -> Values:
+def _histograms(values: Values, start: Ints, low: float, width: float, bins: int) -> Values:
     """Histograms (m, bins) of each section's values; what lies beyond counts in the outer bins."""
     out = np.zeros((len(start) - 1, bins))
     for k in range(len(start) - 1):

@@ -13,12 +13,9 @@ from vinemap.compute.threads import in_threads, stretches
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from vinemap.canopy.points import Sections
+    from vinemap.compute.arrays import Flags, Ints, Values
 
-    Values = NDArray[np.floating]
-    Flags = NDArray[np.bool_]
 
 BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""
@@ -109,7 +106,7 @@ def living_canopies(canopies: Sequence[Canopy], *, min_points: int = 8, min_shar
 def _separate(
     first: int,
     last: int,
-    start: NDArray[np.int64],
+    start: Ints,
     points: Values,
     height: Values,
     limits: tuple[float, float, float, float, float],

@@ -14,12 +14,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from vinemap.canopy.points import Sections
+    from vinemap.compute.arrays import Floats, Ints, Values
 
     Points = NDArray[np.complex128]
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
 
-    Values = NDArray[np.floating]
 
 BLUNT = 0.5
 """Cosine of the turn up to which a corner of a grown outline stays one; sharper ones are cut."""
@@ -92,7 +90,7 @@ def _outward(a: complex, b: complex) -> complex:
     return -1j * edge / abs(edge) if edge != 0 else 0j
 
 
-def foliage_reach(canopy: Sections, area: Values, perimeter: Values, vertices: NDArray[np.int64]) -> Values:
+def foliage_reach(canopy: Sections, area: Values, perimeter: Values, vertices: Ints) -> Values:
     """Metres (m,) by which the foliage reaches beyond the hulls of its points, a mean for every row.
 
     A hull of points falls short of the body that they were taken from, the more the fewer they are: by the share of

@@ -15,9 +15,9 @@ from vinemap.compute.compiled import compiled
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.compute.arrays import Floats, Ints
+
     Points = NDArray[np.complex128]
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
 
 FLAT = 1e-12
 """Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""

@@ -14,16 +14,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     import geopandas as gpd
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from vinemap.canopy.points import Sections
+    from vinemap.compute.arrays import Flags, Floats, Ints, Values
 
-    Vertices = NDArray[np.float64]
-    Faces = NDArray[np.int64]
-    Lofted = tuple[Vertices, Faces, tuple["Piece", ...]]
-
-    Values = NDArray[np.floating]
-    Flags = NDArray[np.bool_]
+    Lofted = tuple[Floats, Ints, tuple["Piece", ...]]
 
 
 class Piece(NamedTuple):
@@ -39,9 +35,9 @@ class Piece(NamedTuple):
 class Mesh:
     """The canopy of one row: closed pieces, triangles counter-clockwise seen from outside."""
 
-    vertices: Vertices
+    vertices: Floats
     """(n, 3) x east, y north, z up, m, in the parcel's metric CRS."""
-    faces: Faces
+    faces: Ints
     """(m, 3) indices of vertices."""
     pieces: tuple[Piece, ...] = ()
     """The lofted pieces that vertices and faces consist of, in their order; none for other meshes."""
@@ -114,14 +110,14 @@ def volume(mesh: Mesh) -> float:
     return _volume(mesh.vertices, mesh.faces)
 
 
-def _volume(vertices: Vertices, faces: Faces) -> float:
+def _volume(vertices: Floats, faces: Ints) -> float:
     if len(faces) == 0:
         return 0.0
     a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def _cap(polygon: Vertices) -> Faces:
+def _cap(polygon: Floats) -> Ints:
     """Triangles (c - 2, 3) of a polygon (c, 3), convex or not, turning as it does (ear clipping)."""
     spread = polygon - polygon.mean(axis=0)
     normal = np.cross(spread, np.roll(spread, -1, axis=0)).sum(axis=0)
@@ -185,7 +181,7 @@ def audit(mesh: Mesh) -> Audit:
     )
 
 
-def _breaks(row_id: NDArray[np.int64], position: Values, step: float) -> Flags:
+def _breaks(row_id: Ints, position: Values, step: float) -> Flags:
     """Whether the canopy ends (m - 1,) between consecutive sections (m,): another row, or more than one lacks."""
     out: Flags = (np.diff(row_id) != 0) | (np.diff(position) > 2.5 * step)
     return out

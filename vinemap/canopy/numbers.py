@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.canopy.points import Sections
+    from vinemap.compute.arrays import Ints, Values
 
-    Values = NDArray[np.floating]
 
 HECTARE = 10_000.0
 """Square metres."""
@@ -28,7 +28,7 @@ LOW, HIGH, TOP = 0.02, 0.98, 0.985
 class Measures(NamedTuple):
     """What is measured of m sections."""
 
-    n_points: NDArray[np.int64]
+    n_points: Ints
     height: Values
     """98.5% height (m,) of the points above ground in metres."""
     bottom: Values
@@ -132,7 +132,7 @@ def complexity_reduction(canopy: Sections, *, c: int) -> Values:
 
 
 @compiled
-def _in_the_one_before(member: NDArray[np.int32], start: NDArray[np.int64], row_id: NDArray[np.int64]) -> Values:
+def _in_the_one_before(member: NDArray[np.int32], start: Ints, row_id: Ints) -> Values:
     """Points (m,) that a section shares with the one before it."""
     out = np.zeros(len(row_id))
     for k in range(1, len(row_id)):
@@ -149,7 +149,7 @@ def _in_the_one_before(member: NDArray[np.int32], start: NDArray[np.int64], row_
     return out
 
 
-def quantile_of(values: Values, start: NDArray[np.int64], q: float) -> Values:
+def quantile_of(values: Values, start: Ints, q: float) -> Values:
     """Quantile (m,) of the values (n,) of each section; 0 where it has none."""
     out = np.zeros(len(start) - 1)
     in_threads(lambda part: _quantiles(*part, np.ascontiguousarray(values), start, q, out), stretches(len(out)))
@@ -157,7 +157,7 @@ def quantile_of(values: Values, start: NDArray[np.int64], q: float) -> Values:
 
 
 @compiled
-def _quantiles(first: int, last: int, values: Values, start: NDArray[np.int64], q: float, out: Values) -> None:
+def _quantiles(first: int, last: int, values: Values, start: Ints, q: float, out: Values) -> None:
     for k in range(first, last):
         if start[k + 1] > start[k]:
             out[k] = np.quantile(values[start[k] : start[k + 1]], q)

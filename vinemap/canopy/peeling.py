@@ -23,10 +23,9 @@ from vinemap.compute.threads import in_threads, stretches
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.compute.arrays import Flags, Floats, Ints
+
     Points = NDArray[np.complex128]
-    Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
-    Flags = NDArray[np.bool_]
 
 
 class Peeled(NamedTuple):

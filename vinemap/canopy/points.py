@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Values = NDArray[np.floating]
+    from vinemap.compute.arrays import Flags, Ints, Values
 
 
 class Sections(NamedTuple):
@@ -23,7 +23,7 @@ class Sections(NamedTuple):
     Points ``start[k]`` to ``start[k + 1]`` are those of section k; a point may be in two sections (a > b).
     """
 
-    row_id: NDArray[np.int64]
+    row_id: Ints
     """Row (m,) of each section."""
     position: Values
     """Metres (m,) along γ."""
@@ -33,7 +33,7 @@ class Sections(NamedTuple):
     """Horizontal unit vectors (m, 2) along γ: the x axes of {LOC_k}."""
     spacing: Values
     """Local inter-row spacing δ (m,) in metres."""
-    start: NDArray[np.int64]
+    start: Ints
     """First point (m + 1,) of each section."""
     points: Values
     """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
@@ -42,7 +42,7 @@ class Sections(NamedTuple):
     member: NDArray[np.int32]
     """Index (n,) of each point in the cloud; it climbs within a section."""
 
-    def subset(self, points: NDArray[np.bool_], sections: NDArray[np.bool_] | None = None) -> Sections:
+    def subset(self, points: Flags, sections: Flags | None = None) -> Sections:
         """The points (n,) and sections (m,; by default all) that are flagged; no point of another section may be."""
         sections = np.ones(len(self.row_id), dtype=bool) if sections is None else sections
         n = np.zeros(len(sections), dtype=np.int64)
@@ -90,9 +90,7 @@ def join(parts: Sequence[Sections]) -> Sections:
 
 
 @compiled
-def _count_flags(
-    first: int, last: int, flags: NDArray[np.bool_], start: NDArray[np.int64], n: NDArray[np.int64]
-) -> None:
+def _count_flags(first: int, last: int, flags: Flags, start: Ints, n: Ints) -> None:
     for k in range(first, last):
         for p in range(start[k], start[k + 1]):
             n[k] += flags[p]
@@ -102,9 +100,9 @@ def _count_flags(
 def _take_flagged(
     first: int,
     last: int,
-    flags: NDArray[np.bool_],
-    start: NDArray[np.int64],
-    place: NDArray[np.int64],
+    flags: Flags,
+    start: Ints,
+    place: Ints,
     old: tuple[Values, Values, NDArray[np.int32]],
     new: tuple[Values, Values, NDArray[np.int32]],
 ) -> None:

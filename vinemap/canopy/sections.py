@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from vinemap.cloud.frame import Taken
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
-    Values = NDArray[np.floating]
 
 T = TypeVar("T")
 
@@ -149,7 +149,7 @@ def _count(left: Values, height: Values, low: float, high: float) -> tuple[int, 
 @compiled
 def _members(
     along: Values, height: Values, position: Values, reach: float, every: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+) -> tuple[Ints, NDArray[np.int32]]:
     """How many points (m,) lie within reach of each position along a row, and which, section after section.
 
     Of the soil's one in so many: chosen by its place, so that the points' order doesn't matter.
@@ -189,7 +189,7 @@ def _fill(
     index: NDArray[np.int32],
     left: Values,
     elevation: Values,
-    start: NDArray[np.int64],
+    start: Ints,
     level: Values,
     points: Values,
 ) -> None:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Grid
 
-    Values = NDArray[np.floating]
     Indices = NDArray[np.int32]
 
 
@@ -25,7 +25,7 @@ class Bins(NamedTuple):
     """Points of cell c, from the grid's north-western corner eastwards, are ``member[start[c]:start[c + 1]]``."""
 
     grid: Grid
-    start: NDArray[np.int64]
+    start: Ints
     """First entry (ny · nx + 1,) of each cell."""
     member: Indices
     """Points (n,) cell by cell, in their order within each."""
@@ -64,7 +64,7 @@ def quantiles_in(bins: Bins, values: Values, quantiles: Sequence[float], *, bloc
 
 
 @compiled
-def _count(first: int, last: int, cell: Indices, cells: int) -> NDArray[np.int64]:
+def _count(first: int, last: int, cell: Indices, cells: int) -> Ints:
     n = np.zeros(cells, dtype=np.int64)
     for p in range(first, last):
         n[cell[p]] += 1
@@ -72,7 +72,7 @@ def _count(first: int, last: int, cell: Indices, cells: int) -> NDArray[np.int64
 
 
 @compiled
-def _place(first: int, last: int, cell: Indices, place: NDArray[np.int64], index: Indices) -> None:
+def _place(first: int, last: int, cell: Indices, place: Ints, index: Indices) -> None:
     for p in range(first, last):
         index[place[cell[p]]] = p
         place[cell[p]] += 1
@@ -107,13 +107,13 @@ def _select(values: Values, first: int, last: int, rank: int) -> None:
 def _quantiles(
     first: int,
     last: int,
-    start: NDArray[np.int64],
+    start: Ints,
     index: Indices,
     values: Values,
     shape: tuple[int, int],
     blocks: int,
     quantiles: Values,
-    n: NDArray[np.int64],
+    n: Ints,
     out: Values,
 ) -> None:
     ny, nx = shape

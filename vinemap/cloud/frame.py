@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Grid
 
-    Values = NDArray[np.floating]
 
 GUIDE = 0.25
 """Metres between the points of a curve to which cloud points are referred, and the cells of their lookup."""
@@ -34,7 +34,7 @@ ROWS_AT_ONCE = 4_000_000
 class RowCoordinates(NamedTuple):
     """Points near rows in the frame of the nearest one, row by row."""
 
-    start: NDArray[np.int64]
+    start: Ints
     """First point (rows + 1,) of each row; ``start[k + 1]`` is past its last."""
     along: NDArray[np.float32]
     """Metres (n,) along the row; negative before its start."""
@@ -44,14 +44,14 @@ class RowCoordinates(NamedTuple):
     """Index (n,) of the point in the cloud."""
 
 
-Taken = tuple["NDArray[np.floating]", ...]
+Taken = tuple["Values", ...]
 """What is taken of points beside their coordinates: arrays (n,)."""
 
 
 class _Guides(NamedTuple):
     """Points on curves to which cloud points are referred: row (g,), metres along it, place and tangent (g, 2)."""
 
-    row: NDArray[np.int64]
+    row: Ints
     along: Values
     xy: Values
     tangent: Values
@@ -67,7 +67,7 @@ class _Lookup(NamedTuple):
 
 def points_of_rows(
     cloud: Cloud, curves: Sequence[Values], reach: Values, take: Callable[[PointCloud, NDArray[np.int32]], Taken]
-) -> Iterator[tuple[NDArray[np.int64], RowCoordinates, Taken]]:
+) -> Iterator[tuple[Ints, RowCoordinates, Taken]]:
     """Refer a cloud's points within ``reach`` (rows,) metres of their nearest curve (k, 2) to it.
 
     Yields rows (a,), the frame's coordinates of their points row by row, and for each point what ``take`` tells of a
@@ -87,7 +87,7 @@ def points_of_rows(
         yield rows, *_joined(found, rows)
 
 
-def _groups(rows: Sequence[Values], size: int) -> list[NDArray[np.int64]]:
+def _groups(rows: Sequence[Values], size: int) -> list[Ints]:
     """Indices of rows, as curves (k, 2), that lie beside each other in a cloud of so many points, group by group."""
     middles = np.array([row[len(row) // 2] for row in rows])
     widest = int(np.argmax(np.ptp(middles, axis=0)))
@@ -95,7 +95,7 @@ def _groups(rows: Sequence[Values], size: int) -> list[NDArray[np.int64]]:
     return [np.sort(part) for part in np.array_split(np.argsort(middles[:, widest], kind="stable"), groups)]
 
 
-def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int64]) -> tuple[RowCoordinates, Taken]:
+def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: Ints) -> tuple[RowCoordinates, Taken]:
     """Points of some rows, from several parts, row by row."""
     n = np.array([np.diff(near.start)[rows] for near, _ in found])
     start = np.concatenate([[0], np.cumsum(n.sum(axis=0))])
@@ -108,7 +108,7 @@ def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: NDArray[np.int6
     return RowCoordinates(start, *columns[:3]), tuple(columns[3:])
 
 
-def _lookup(curves: Sequence[Values], reach: Values, rows: NDArray[np.int64]) -> _Lookup:
+def _lookup(curves: Sequence[Values], reach: Values, rows: Ints) -> _Lookup:
     """Guides of all curves, and the nearest ones about some of the rows."""
     lengths = [float(way_along(curve)[-1]) for curve in curves]
     positions = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
@@ -164,7 +164,7 @@ def _find_guides(
     lookup: _Lookup,
     reach: Values,
     guide: NDArray[np.int32],
-) -> NDArray[np.int64]:
+) -> Ints:
     """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach; points of each row."""
     grid, nearest, guides = lookup
     n = np.zeros(len(reach), dtype=np.int64)
@@ -188,7 +188,7 @@ def _refer(
     xyz: Values,
     guide: NDArray[np.int32],
     guides: _Guides,
-    place: NDArray[np.int64],
+    place: Ints,
     out: RowCoordinates,
 ) -> None:
     """Write the coordinates of the points (n, ≥2) that have a guide, each row's from its place (rows,) on."""

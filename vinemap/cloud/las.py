@@ -22,13 +22,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
     from pyproj import CRS
 
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Floats
 
-    Points = NDArray[np.float64]
-    Box = tuple[Points, Points]
+    Box = tuple[Floats, Floats]
 
 CHUNK = 500_000
 """Points that are decompressed at once."""
@@ -95,7 +94,7 @@ def collected(points: Collector, crs: CRS, vertical: str | None, path: Path) -> 
 @contextmanager
 def open_cloud(
     path: Path, *, crs: CRS | None = None, around: Boundary | None = None
-) -> Iterator[tuple[CRS, str | None, Iterator[Points]]]:
+) -> Iterator[tuple[CRS, str | None, Iterator[Floats]]]:
     """Open a LAS, LAZ or COPC file: gives its metric projected CRS, its vertical datum, and chunks of points (n, 3).
 
     Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
@@ -206,7 +205,7 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
         )
 
 
-def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Points]:
+def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Floats]:
     """Coordinates (n, 3) of a file's usable points, or of those found, in its own CRS, chunk by chunk."""
     total, done = reader.header.point_count if found is None else len(found), 0
     try:
@@ -276,7 +275,7 @@ def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
 
-def _usable(chunk: Any) -> NDArray[np.float64]:
+def _usable(chunk: Any) -> Floats:
     """Coordinates (n, 3) of the points of a chunk that aren't flagged as noise and are numbers."""
     xyz = np.column_stack([chunk.x, chunk.y, chunk.z])
     classes = np.asarray(chunk.classification)
@@ -288,7 +287,7 @@ def _usable(chunk: Any) -> NDArray[np.float64]:
     return xyz
 
 
-def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np.float64]:
+def _to_metric(xyz: Floats, source: CRS, target: CRS) -> Floats:
     flat = horizontal(source)
     if flat != target:
         xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
@@ -297,7 +296,7 @@ def _to_metric(xyz: NDArray[np.float64], source: CRS, target: CRS) -> NDArray[np
     return xyz
 
 
-def _plausible(sample: Points, path: Path) -> tuple[Points, Points]:
+def _plausible(sample: Floats, path: Path) -> tuple[Floats, Floats]:
     """Corners (3,) beyond which a survey, of whose points there is a sample (n, 3), has only strays.
 
     Strays are few, but would stretch every raster.

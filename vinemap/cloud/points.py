@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.cloud.bins import Bins
+    from vinemap.compute.arrays import Floats, Values
     from vinemap.geo.raster import Grid, Raster
-
-    Values = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,10 @@ class PointCloud:
     ``classification`` (n,) holds ASPRS classes, where the engine that read the points gives them.
     """
 
-    xyz: NDArray[np.float64]
+    xyz: Floats
     crs: CRS
     vertical: str | None = None
-    heights: NDArray[np.floating] = field(default_factory=lambda: np.empty(0, dtype=np.float32))
+    heights: Values = field(default_factory=lambda: np.empty(0, dtype=np.float32))
     first: int = 0
     classification: NDArray[np.uint8] | None = None
     _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
@@ -46,11 +45,11 @@ class PointCloud:
         return len(self.xyz)
 
     @property
-    def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def extent(self) -> tuple[Floats, Floats]:
         """Least and greatest coordinates (3,)."""
         if "extent" not in self._kept:
             self._kept["extent"] = extent(self.xyz)
-        corners: tuple[NDArray[np.float64], NDArray[np.float64]] = self._kept["extent"]
+        corners: tuple[Floats, Floats] = self._kept["extent"]
         return corners
 
     def parts(self, near: shapely.Geometry | None = None, reach: float = 0.0) -> Iterator[PointCloud]:

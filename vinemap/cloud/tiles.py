@@ -16,12 +16,11 @@ from vinemap.geo.raster import extent, squares
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.compute.arrays import Floats
     from vinemap.geo.raster import Raster
 
-    Points = NDArray[np.float64]
 
 CHUNK = 1_000_000
 """Points that are moved to tiles at once."""
@@ -35,8 +34,8 @@ class Tile(NamedTuple):
     """A file of points (n, 3) as float64, their extent, and the index of the first in the cloud."""
 
     path: Path
-    low: Points
-    high: Points
+    low: Floats
+    high: Floats
     size: int
     first: int = 0
 
@@ -59,7 +58,7 @@ class TiledCloud:
         return sum(tile.size for tile in self.tiles)
 
     @property
-    def extent(self) -> tuple[Points, Points]:
+    def extent(self) -> tuple[Floats, Floats]:
         """Least and greatest coordinates (3,)."""
         low, high = (np.array([tile[k] for tile in self.tiles]) for k in (1, 2))
         return low.min(axis=0), high.max(axis=0)
@@ -93,7 +92,7 @@ class Collector:
         self.tiles: dict[Path, Tile] = {}
         self.size = 0
 
-    def add(self, xyz: Points) -> None:
+    def add(self, xyz: Floats) -> None:
         """Take points (n, 3)."""
         before, self.size = self.size, self.size + len(xyz)
         if self.size <= self.most:
@@ -106,7 +105,7 @@ class Collector:
         self.xyz = np.empty((0, 3))
         self._to_tiles(xyz)
 
-    def cloud(self, crs: CRS, vertical: str | None, least: Points, most: Points) -> Cloud:
+    def cloud(self, crs: CRS, vertical: str | None, least: Floats, most: Floats) -> Cloud:
         """What was taken and lies between two corners (3,)."""
         if not self.tiles:
             low, high = extent(self.xyz)
@@ -121,7 +120,7 @@ class Collector:
                 first += kept.size
         return TiledCloud(tiles, crs, vertical)
 
-    def sample(self, n: int) -> Points:
+    def sample(self, n: int) -> Floats:
         """About n of the points, evenly."""
         step = max(1, self.size // n)
         if not self.tiles:
@@ -132,7 +131,7 @@ class Collector:
             passed += tile.size
         return np.concatenate(parts)
 
-    def _to_tiles(self, xyz: Points) -> None:
+    def _to_tiles(self, xyz: Floats) -> None:
         if len(xyz) == 0:
             return
         self.folder.mkdir(exist_ok=True)
@@ -152,7 +151,7 @@ class Collector:
             self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))
 
 
-def _between(tile: Tile, least: Points, most: Points) -> Tile:
+def _between(tile: Tile, least: Floats, most: Floats) -> Tile:
     """A tile, on disk too, with no points but those between two corners (3,)."""
     if (tile.low >= least).all() and (tile.high <= most).all():
         return tile

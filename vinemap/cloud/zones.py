@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Points = NDArray[np.float64]
+    from vinemap.compute.arrays import Floats, Ints
+
     Labels = NDArray[np.int32]
-    Indices = NDArray[np.int64]
 
 CELL = 0.5
 """Metres of a cell, at the least."""
@@ -59,7 +59,7 @@ def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
     return Zones(polygons, grid, code)
 
 
-def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
+def deal(xyz: Floats, zones: Zones) -> tuple[Floats, Ints]:
     """Give every polygon its points; those in none go to nobody, those in several to each.
 
     Returns
@@ -81,7 +81,7 @@ def deal(xyz: Points, zones: Zones) -> tuple[Points, Indices]:
     return _gather(xyz, label, p[~first], k[~first], len(zones.polygons))
 
 
-def _ask(xyz: Points, polygons: Sequence[shapely.Geometry]) -> tuple[Indices, Labels]:
+def _ask(xyz: Floats, polygons: Sequence[shapely.Geometry]) -> tuple[Ints, Labels]:
     """Points (n, 3) and the polygons that hold them, pair by pair; eastwards, so that each polygon asks few points."""
     eastwards = np.argsort(xyz[:, 0])
     x, y = xyz[eastwards, 0], xyz[eastwards, 1]
@@ -97,14 +97,14 @@ def _ask(xyz: Points, polygons: Sequence[shapely.Geometry]) -> tuple[Indices, La
 
 
 @compiled
-def _look_up(xyz: Points, grid: Grid, code: Labels, label: Labels) -> None:
+def _look_up(xyz: Floats, grid: Grid, code: Labels, label: Labels) -> None:
     for p in range(len(xyz)):
         i, j = cell_at(grid, xyz[p, 0], xyz[p, 1])
         label[p] = code[i, j] if 0 <= i < grid.ny and 0 <= j < grid.nx else NOWHERE
 
 
 @compiled
-def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) -> tuple[Points, Indices]:
+def _gather(xyz: Floats, label: Labels, again: Ints, into: Labels, k: int) -> tuple[Floats, Ints]:
     """Points by label (n,), and those ``again``, in climbing order, that a further polygon holds too."""
     start = np.zeros(k + 1, dtype=np.int64)
     for zone in label:
@@ -125,7 +125,7 @@ def _gather(xyz: Points, label: Labels, again: Indices, into: Labels, k: int) ->
 
 
 @compiled
-def _copy(xyz: Points, p: int, out: Points, place: Indices, zone: int) -> None:
+def _copy(xyz: Floats, p: int, out: Floats, place: Ints, zone: int) -> None:
     """Write point p to its zone's place, and move that on; a row at once would be far slower."""
     at = place[zone]
     out[at, 0], out[at, 1], out[at, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]

@@ -10,9 +10,8 @@ from pydantic import Field, model_validator
 from vinemap.config.settings import Options
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Values
 
-    Array = NDArray[np.floating]
 
 LENS_TERMS = (0, 4, 5, 8)
 NARROWEST, WIDEST = 2.0, 150.0
@@ -65,22 +64,22 @@ class Camera(Options):
         )
 
     @property
-    def matrix(self) -> Array:
+    def matrix(self) -> Values:
         """Intrinsic matrix (3, 3) of OpenCV."""
         return np.array([[self.fx, 0, self.axis[0]], [0, self.fy, self.axis[1]], [0, 0, 1.0]])
 
     @property
-    def to_robot(self) -> Array:
+    def to_robot(self) -> Values:
         """Matrix (2, 3) from (column, row, 1) in an image to x forward and y to the left in mm (Eq. 2)."""
         c, s = np.cos(np.radians(self.turned_deg)), np.sin(np.radians(self.turned_deg))
         gx, gy = self.above_ground_mm / self.fx, self.above_ground_mm / self.fy
         turn = np.array([[c, -s], [s, c]]) @ np.diag([gx, -gy])
         return np.column_stack([turn, np.array([self.x_mm, self.y_mm]) - turn @ self.axis])
 
-    def ground(self, column: float, row: float) -> Array:
+    def ground(self, column: float, row: float) -> Values:
         """Place (2,) in the robot's frame in mm of a point of the image."""
         return np.asarray(self.to_robot @ np.array([column, row, 1.0]))
 
-    def pixel(self, x_mm: float, y_mm: float) -> Array:
+    def pixel(self, x_mm: float, y_mm: float) -> Values:
         """Column and row (2,) of a place in the robot's frame: the inverse of :meth:`ground`."""
         return np.asarray(np.linalg.solve(self.to_robot[:, :2], np.array([x_mm, y_mm]) - self.to_robot[:, 2]))

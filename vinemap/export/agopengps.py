@@ -17,11 +17,9 @@ from vinemap import paths
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Floats
     from vinemap.export.field import Field
 
-    Values = NDArray[np.float64]
 
 STEP, FEWEST = 1.0, 5
 """Metres between points, as AgOpenGPS itself records them, and how many it wants of a curve."""
@@ -76,7 +74,7 @@ def write_agopengps(field: Field, folder: Path, *, lines: str) -> None:
     _write(paths.agopengps_file(target, "TrackLines"), text)
 
 
-def _on_plane(lon_lat: Values, start: tuple[float, float]) -> Values:
+def _on_plane(lon_lat: Floats, start: tuple[float, float]) -> Floats:
     """Easting and northing of degrees, in AgOpenGPS's plane about a latitude and longitude."""
     lat = np.radians(lon_lat[:, 1])
     origin = np.radians(start[0])
@@ -85,7 +83,7 @@ def _on_plane(lon_lat: Values, start: tuple[float, float]) -> Values:
     return np.column_stack([(lon_lat[:, 0] - start[1]) * east, (lon_lat[:, 1] - start[0]) * north])
 
 
-def _stepped(points: Values) -> Values:
+def _stepped(points: Floats) -> Floats:
     """Points (n, 3) a metre apart or less: easting, northing, heading in radians clockwise from north."""
     line = shapely.LineString(points)
     xy = shapely.get_coordinates(shapely.segmentize(line, min(STEP, line.length / FEWEST)))
@@ -93,12 +91,12 @@ def _stepped(points: Values) -> Values:
     return np.column_stack([xy, heading])
 
 
-def _heading(way: Values) -> Values:
-    out: Values = np.arctan2(way[0], way[1]) % (2 * np.pi)
+def _heading(way: Floats) -> Floats:
+    out: Floats = np.arctan2(way[0], way[1]) % (2 * np.pi)
     return out
 
 
-def _points(course: Values) -> list[str]:
+def _points(course: Floats) -> list[str]:
     return [f"{_number(east)},{_number(north)},{heading:.5f}" for east, north, heading in course]
 
 

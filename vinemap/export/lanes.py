@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from vinemap.compute.arrays import Floats
     from vinemap.export.neighbours import Pair, Side
 
-    Values = NDArray[np.float64]
 
 TANGENT = 2.0
 """Metres at the end of a lane that give its direction there."""
@@ -35,8 +35,8 @@ PLAN_TOLERANCE, HEIGHT_TOLERANCE = 0.01, 0.03
 class _Course(NamedTuple):
     """Places on a lane: the points, and half the distance between the rows there, NaN where only one is there."""
 
-    xyz: Values
-    half: Values
+    xyz: Floats
+    half: Floats
 
 
 def lanes_between(
@@ -112,7 +112,7 @@ def _members(pairs: list[Pair]) -> tuple[list[int], list[int]]:
 
 
 def _course(
-    right: list[int], left: list[int], sides: dict[Pair, Side], lanes: dict[Pair, int], curves: list[Values]
+    right: list[int], left: list[int], sides: dict[Pair, Side], lanes: dict[Pair, int], curves: list[Floats]
 ) -> _Course:
     """Places on a lane in order: from its right rows, and where there is none, from its left ones."""
     number = next(lanes[i, j] for i in right for j in left if (i, j) in lanes)
@@ -135,7 +135,7 @@ def _course(
     return _Course(xyz[keep], half[keep])
 
 
-def _midway(side: Side, others: list[Values]) -> _Course:
+def _midway(side: Side, others: list[Floats]) -> _Course:
     """Points as far from a row as from the other, or others that go on after one another."""
     lines = [shapely.simplify(shapely.LineString(curve[:, :2]), FINE) for curve in others]
     every = shapely.multilinestrings(lines)
@@ -164,7 +164,7 @@ def _midway(side: Side, others: list[Values]) -> _Course:
     return _Course(np.column_stack([xy, side.xyz[:, 2] + rise / 2]), np.where(met, half, np.nan))
 
 
-def _apart(station: Values) -> list[int]:
+def _apart(station: Floats) -> list[int]:
     """Positions of sorted stations that are at least half a step apart, the last one among them."""
     keep = [0]
     for k in range(1, len(station)):
@@ -176,7 +176,7 @@ def _apart(station: Values) -> list[int]:
 
 
 def _beside(
-    sides: dict[Pair, Side], lanes: dict[Pair, int], spacing: Values
+    sides: dict[Pair, Side], lanes: dict[Pair, int], spacing: Floats
 ) -> Iterator[tuple[list[int], list[int], _Course]]:
     """Lanes along the sides of rows that have no neighbour."""
     for (i, sign), side in sides.items():
@@ -212,7 +212,7 @@ def _describe(
     }
 
 
-def _driven(xyz: Values, headland: float, clearance: float, tree: shapely.STRtree) -> shapely.LineString:
+def _driven(xyz: Floats, headland: float, clearance: float, tree: shapely.STRtree) -> shapely.LineString:
     """A lane in few vertices, carried straight on at both ends, and nowhere across a row."""
     line = shapely.LineString(xyz)
     crossed = tree.geometries[tree.query(line, predicate="intersects")]
@@ -235,7 +235,7 @@ def _driven(xyz: Values, headland: float, clearance: float, tree: shapely.STRtre
     return _light(np.concatenate([ends[0], xyz, ends[1]]))
 
 
-def _light(xyz: Values) -> shapely.LineString:
+def _light(xyz: Floats) -> shapely.LineString:
     """A line with the vertices that its course in plan and its profile need (Douglas and Peucker 1973)."""
     number = np.arange(len(xyz))
     profile = np.column_stack([way_along(xyz[:, :2]), xyz[:, 2], number])

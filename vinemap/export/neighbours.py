@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    Values = NDArray[np.float64]
-    Indices = NDArray[np.int64]
+    from vinemap.compute.arrays import Floats, Ints
+
 
 STEP = 0.5
 """Metres between the places of a row from which it looks around."""
@@ -32,17 +32,17 @@ class Side(NamedTuple):
     """One side of a row, every half metre."""
 
     row: int
-    along: Values
-    xyz: Values
-    normal: Values
-    facing: Indices
+    along: Floats
+    xyz: Floats
+    normal: Floats
+    facing: Ints
     """Row that is seen along the normal, -1 where there is none within sight."""
-    distance: Values
+    distance: Floats
 
 
-def aligned(rows: gpd.GeoDataFrame) -> list[Values]:
+def aligned(rows: gpd.GeoDataFrame) -> list[Floats]:
     """Curves (n, 3) of the rows, all in one direction in each block: that of most."""
-    curves: list[Values] = [shapely.get_coordinates(line, include_z=True) for line in rows.geometry]
+    curves: list[Floats] = [shapely.get_coordinates(line, include_z=True) for line in rows.geometry]
     chords = np.array([curve[-1, :2] - curve[0, :2] for curve in curves]).reshape(-1, 2)
     blocks = rows["block"].to_numpy()
     for block in np.unique(blocks):
@@ -53,14 +53,14 @@ def aligned(rows: gpd.GeoDataFrame) -> list[Values]:
     return curves
 
 
-def look(i: int, sign: int, curves: list[Values], spacing: Values, tree: shapely.STRtree) -> Side:
+def look(i: int, sign: int, curves: list[Floats], spacing: Floats, tree: shapely.STRtree) -> Side:
     """What a row sees to its left (1) or right (-1)."""
     curve = curves[i]
     way = way_along(curve[:, :2])
     along = np.linspace(0, way[-1], max(3, int(np.ceil(way[-1] / STEP)) + 1))
     xyz = np.column_stack([at(curve[:, :2], along), np.interp(along, way, curve[:, 2])])
     tangent = tangents(curve[:, :2], along)
-    left: Values = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    left: Floats = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     normal = left if sign > 0 else -left
     reach = SIGHT * float(np.nan_to_num(spacing[i]))
     rays = np.array([shapely.LineString(ends) for ends in np.stack([xyz[:, :2], xyz[:, :2] + reach * normal], axis=1)])
@@ -68,14 +68,14 @@ def look(i: int, sign: int, curves: list[Values], spacing: Values, tree: shapely
     place, row = place[row != i], row[row != i]
     points = shapely.points(xyz[place, :2])
     seen = np.asarray(shapely.distance(points, shapely.intersection(rays[place], tree.geometries[row])))
-    facing: Indices = np.full(len(along), -1)
-    distance: Values = np.full(len(along), np.inf)
+    facing: Ints = np.full(len(along), -1)
+    distance: Floats = np.full(len(along), np.inf)
     for k in np.argsort(-seen):  # the nearest comes last, and stays
         facing[place[k]], distance[place[k]] = row[k], seen[k]
     return Side(i, along, xyz, normal, facing, distance)
 
 
-def pair_rows(sides: dict[Pair, Side], spacing: Values, blocks: NDArray[np.generic]) -> dict[Pair, int]:
+def pair_rows(sides: dict[Pair, Side], spacing: Floats, blocks: NDArray[np.generic]) -> dict[Pair, int]:
     """Number of the lane of each two neighbours; pairs share one where a row goes on after a gap."""
     runs: dict[tuple[int, int], list[tuple[Pair, float, float]]] = {}
     for (i, sign), side in sides.items():
@@ -95,7 +95,7 @@ def pair_rows(sides: dict[Pair, Side], spacing: Values, blocks: NDArray[np.gener
     return number
 
 
-def belonging(side: Side, sign: int, lanes: dict[Pair, int]) -> Indices:
+def belonging(side: Side, sign: int, lanes: dict[Pair, int]) -> Ints:
     """Number of the lane of each place: where nothing is faced, that of the nearest place with one; -1 if none has."""
     pairs = [(side.row, j) if sign > 0 else (j, side.row) for j in side.facing.tolist()]
     number = np.array([lanes.get(pair, -1) for pair in pairs])
@@ -103,5 +103,5 @@ def belonging(side: Side, sign: int, lanes: dict[Pair, int]) -> Indices:
     if len(known) == 0:
         return number
     nearest = known[np.abs(np.arange(len(number))[:, None] - known).argmin(axis=1)]
-    out: Indices = number[nearest]
+    out: Ints = number[nearest]
     return out

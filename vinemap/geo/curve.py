@@ -8,9 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Values = NDArray[np.floating]
+    from vinemap.compute.arrays import Values
 
 
 def at(curve: Values, position: Values) -> Values:

@@ -16,15 +16,15 @@ from vinemap.geo.crs import is_ellipsoidal, to_wgs84
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    Points = NDArray[np.float64]
+    from vinemap.compute.arrays import Floats
 
 
 class Geoid(NamedTuple):
     """What is added to heights to make them ellipsoidal."""
 
-    height: Callable[[Points], Points]
+    height: Callable[[Floats], Floats]
     """Metres of the geoid above the ellipsoid (n,) at points (n, 3) of the CRS."""
     source: str
     """Where it is from, in words."""
@@ -72,7 +72,7 @@ def find_geoid(vertical: str | None, crs: CRS, at: ArrayLike, *, given: float | 
         if transform.accuracy < 0:
             continue
 
-        def height(points: Points, convert: Callable[..., Any] = transform.transform) -> Points:
+        def height(points: Floats, convert: Callable[..., Any] = transform.transform) -> Floats:
             return np.asarray(convert(points[:, 0], points[:, 1], np.zeros(len(points)))[2])
 
         if np.isfinite(height(points)).all():

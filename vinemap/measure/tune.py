@@ -26,12 +26,10 @@ from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_rows, model_canopies
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vinemap.canopy.model import CanopyModel
+    from vinemap.compute.arrays import Flags, Values
     from vinemap.parcel import RowMap
 
-    Values = NDArray[np.floating]
 
 BOUNDS = [(0.1, 1.0), (0.1, 2.0), (5, 11)]
 """The thesis's ranges of a and b, in metres, and of c."""
@@ -89,7 +87,7 @@ def _model(found: RowMap, sections: dict[str, float], c: int, foot: str) -> Cano
     return model_canopies(found, settings)
 
 
-def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tuple[Values, NDArray[np.bool_]]:
+def _between(model: CanopyModel, reference: CanopyModel, *, reach: float) -> tuple[Values, Flags]:
     """Polygons (n, c, 2) of a model's mesh at the sections of the reference, and whether it has one there."""
     mine, wanted = model.at, reference.at
     out = np.full((len(wanted.row_id), *model.polygons.shape[1:]), np.nan)

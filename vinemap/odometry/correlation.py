@@ -12,9 +12,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Values
 
-    Array = NDArray[np.floating]
     Box = tuple[range, range, range]
     Index = tuple[int, int, int]
 
@@ -37,8 +36,8 @@ class Place(NamedTuple):
 class Search(NamedTuple):
     """Two images, and where a template of the first is looked for in the second."""
 
-    a: Array
-    b: Array
+    a: Values
+    b: Values
     centre: tuple[int, int]
     """Row and column of the template in the first."""
     half: int
@@ -52,7 +51,7 @@ class Search(NamedTuple):
 
 
 def search_of(
-    a: Array, b: Array, *, centre: tuple[int, int], half: int, step: float, angles: tuple[float, float], cubic: bool
+    a: Values, b: Values, *, centre: tuple[int, int], half: int, step: float, angles: tuple[float, float], cubic: bool
 ) -> Search:
     """Look for a template at all places of the second image and at angles between two, in degrees."""
     height, width = b.shape
@@ -60,19 +59,19 @@ def search_of(
     return Search(a, b, centre, half, step, cubic, (turns, range(half, height - half), range(half, width - half)))
 
 
-def place_at(search: Search, index: Sequence[float] | Array) -> Place:
+def place_at(search: Search, index: Sequence[float] | Values) -> Place:
     """The place of an index, which may lie between whole numbers."""
     return Place(float(index[0] * search.step), float(index[1]), float(index[2]))
 
 
-def warp(angle: float, source: Sequence[float] | Array, target: Sequence[float] | Array) -> Array:
+def warp(angle: float, source: Sequence[float] | Values, target: Sequence[float] | Values) -> Values:
     """Matrix (2, 3) to pixels of an image from those of the next, (row, column) of a point in both given."""
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     turn = np.array([[c, s], [-s, c]])
     return np.column_stack([turn, np.array(source)[::-1] - turn @ np.array(target)[::-1]])
 
 
-def correlation(search: Search, box: Box) -> Array:
+def correlation(search: Search, box: Box) -> Values:
     """γ(u, v, ϑ) of Eq. 5 at the angles, rows and columns of a box, (n, rows, columns)."""
     import cv2
 

@@ -9,11 +9,9 @@ import numpy as np
 from vinemap.odometry.correlation import Place, Search, correlation, near, place_at, warp
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Values
     from vinemap.odometry.correlation import Index
 
-    Array = NDArray[np.floating]
 
 Method = Literal["aligned", "quadratic", "centroid", "maximum"]
 NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95
@@ -35,7 +33,7 @@ def refine(search: Search, top: Index, method: Method) -> Place:
             return _aligned(search, _vertex(search, top))
 
 
-def _around(search: Search, top: Index, reach: int) -> tuple[Array, Array]:
+def _around(search: Search, top: Index, reach: int) -> tuple[Values, Values]:
     """Steps from a peak (n, 3), and the correlations there."""
     box = near(search, top, (reach, reach, reach))
     steps = np.stack(np.meshgrid(*box, indexing="ij"), axis=-1) - top

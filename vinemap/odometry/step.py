@@ -27,12 +27,9 @@ from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Image, Values
     from vinemap.config.camera import Camera
 
-    Array = NDArray[np.floating]
-    Image = NDArray[np.uint8]
 
 Strategy = Literal["coarse to fine", "exhaustive"]
 ANGLES = (-9.0, 9.0)
@@ -192,12 +189,12 @@ def expected_overlap(camera: Camera, movement: Pose) -> float:
     return float(right * down)
 
 
-def _middle(camera: Camera) -> Array:
+def _middle(camera: Camera) -> Values:
     """Column and row of the middle of a frame."""
     return np.array([camera.width // 2, camera.height // 2])
 
 
-def _next_middle(camera: Camera, movement: Pose) -> Array:
+def _next_middle(camera: Camera, movement: Pose) -> Values:
     """Column and row in a frame of the middle of the next."""
     x, y = camera.ground(*_middle(camera))
     there = onward(movement, Pose(x, y, 0.0))

@@ -9,13 +9,10 @@ import numpy as np
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Image, Values
     from vinemap.config.camera import Camera
     from vinemap.odometry.refinement import Method
 
-    Array = NDArray[np.floating]
-    Image = NDArray[np.uint8]
 
 SMOOTHING, SMOOTHED_SIZE = 1.0, 240
 """Sigma in pixels of the Gaussian that both frames get, as interpolation blurs the turned template, and only that one;
@@ -31,10 +28,10 @@ LEAST_CONTRAST = 1.0
 class View(NamedTuple):
     """A frame, ready to be compared with others."""
 
-    image: Array
+    image: Values
     """Smoothed, but for the standard algorithm."""
-    coarse: Array
-    detail: Array
+    coarse: Values
+    detail: Values
     """The coarse one without uneven light."""
     contrast: float
     """Standard deviation in grey levels."""
@@ -61,13 +58,13 @@ def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View
     return View(kept, coarse, coarse - cv2.GaussianBlur(coarse, (0, 0), BACKGROUND), contrast, sharpness)
 
 
-def coarseness(image: Array) -> int:
+def coarseness(image: Values) -> int:
     """Pixels along the side of one of the coarse search's."""
     shorter: int = min(image.shape)
     return max(1, round(shorter / COARSE_SIZE))
 
 
-def _reduced(image: Array) -> Array:
+def _reduced(image: Values) -> Values:
     """Means of squares of pixels."""
     import cv2
 

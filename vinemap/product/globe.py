@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from vinemap.canopy.mesh import Mesh
+    from vinemap.compute.arrays import Floats
     from vinemap.geo.geoid import Geoid
 
-    Points = NDArray[np.float64]
 
 GEODETIC, GEOCENTRIC = CRS.from_epsg(4979), CRS.from_epsg(4978)
 STEP = 10.0
@@ -41,14 +41,14 @@ FRAME = np.eye(3)
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-def to_globe(xyz: ArrayLike, crs: CRS, geoid: Geoid) -> Points:
+def to_globe(xyz: ArrayLike, crs: CRS, geoid: Geoid) -> Floats:
     """Earth-centred, earth-fixed coordinates (n, 3; EPSG:4978) of points (n, 3) in a projected CRS."""
     points = np.atleast_2d(np.asarray(xyz, dtype=float))
     lat, lon, alt = to_wgs84(points, crs).T
     return np.column_stack(transformer(GEODETIC, GEOCENTRIC).transform(lon, lat, alt + geoid.height(points)))
 
 
-def placement(origin: ArrayLike, crs: CRS, geoid: Geoid) -> Points:
+def placement(origin: ArrayLike, crs: CRS, geoid: Geoid) -> Floats:
     """Affine matrix (4, 4) from metres about a point of a projected CRS (east, north, up) to the globe.
 
     Its columns are the derivatives of :func:`to_globe`, so that the projection's grid convergence and scale, and the
@@ -94,7 +94,7 @@ def parcel_tileset(
     ends = np.vstack([origin, vertices.min(axis=0), vertices.max(axis=0)])
     found = find_geoid(vertical, crs, ends, given=geoid)
     matrix = placement(origin, crs, found)
-    local: Points = vertices - np.asarray(origin)
+    local: Floats = vertices - np.asarray(origin)
     error = np.linalg.norm(_moved(local, matrix) - to_globe(vertices, crs, found), axis=1).max()
     box = _enclose(local)
     extras = {
@@ -144,7 +144,7 @@ def survey_tileset(tilesets: Sequence[Path]) -> dict[str, Any] | None:
 
 
 class _Tile(NamedTuple):
-    box: Points
+    box: Floats
     """Centre and half axes (4, 3) on the globe."""
     uri: str
 
@@ -164,29 +164,29 @@ def _gather(tiles: Sequence[_Tile]) -> dict[str, Any]:
     return _node(_enclose(corners.reshape(-1, 3), axes)) | {"children": children}
 
 
-def _node(box: Points) -> dict[str, Any]:
+def _node(box: Floats) -> dict[str, Any]:
     return {"boundingVolume": {"box": box.round(4).ravel().tolist()}, "geometricError": _span(box)}
 
 
-def _split(tiles: Sequence[_Tile], n: int, axis: Points) -> list[list[_Tile]]:
+def _split(tiles: Sequence[_Tile], n: int, axis: Floats) -> list[list[_Tile]]:
     """Tiles in n parts of as many, one behind the other along an axis."""
     order = sorted(tiles, key=lambda tile: float(tile.box[0] @ axis))
     return [order[len(order) * k // n : len(order) * (k + 1) // n] for k in range(n)]
 
 
-def _moved(points: Points, matrix: Points) -> Points:
-    moved: Points = points @ matrix[:3, :3].T + matrix[:3, 3]
+def _moved(points: Floats, matrix: Floats) -> Floats:
+    moved: Floats = points @ matrix[:3, :3].T + matrix[:3, 3]
     return moved
 
 
-def _enclose(points: Points, axes: Points = FRAME) -> Points:
+def _enclose(points: Floats, axes: Floats = FRAME) -> Floats:
     """Centre and half axes (4, 3) of the box along three axes, in rows, around points (n, 3)."""
     along = points @ axes.T
     low, high = along.min(axis=0) - PAD, along.max(axis=0) + PAD
     return np.vstack([(low + high) / 2 @ axes, (high - low)[:, None] / 2 * axes]).round(4)
 
 
-def _east_north_up(point: Points) -> Points:
+def _east_north_up(point: Floats) -> Floats:
     """Axes (3, 3), in rows, of the topocentric frame at a point on the globe."""
     lon, lat, _ = transformer(GEOCENTRIC, GEODETIC).transform(point[0], point[1], point[2], radians=True)
     east = [-math.sin(lon), math.cos(lon), 0.0]
@@ -194,6 +194,6 @@ def _east_north_up(point: Points) -> Points:
     return np.array([east, np.cross(up, east), up])
 
 
-def _span(box: Points) -> float:
+def _span(box: Floats) -> float:
     """Metres across a box."""
     return round(2 * float(np.linalg.norm(box[1:])), 1)

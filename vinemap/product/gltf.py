@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pyproj import CRS
 
-    Vertices = NDArray[np.float64]
+    from vinemap.compute.arrays import Floats, Ints
+
 
 STRIP = 5
 """glTF's mode of triangle strips."""
@@ -39,7 +40,7 @@ class Canopies(NamedTuple):
     crs: CRS
     vertical: str | None
     """Name of the vertical datum."""
-    origin: NDArray[np.float64]
+    origin: Floats
     """(3,) the file's own origin in the CRS, m."""
 
 
@@ -66,7 +67,7 @@ def read_glb(path: Path) -> Canopies:
     return Canopies(meshes, crs, vertical, origin)
 
 
-def _read_row(document: Any, node: Any, origin: NDArray[np.float64]) -> Mesh:
+def _read_row(document: Any, node: Any, origin: Floats) -> Mesh:
     about = {"row_id": node.extras["row_id"], "label": node.name, "extras": node.extras}
     if node.mesh is None:
         return Mesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), **about)
@@ -92,9 +93,9 @@ def _array(document: Any, index: int, width: int) -> NDArray[Any]:
     return np.ndarray((accessor.count, width), kind, document.binary_blob(), start, strides)
 
 
-def _triangles(strip: NDArray[np.int64]) -> NDArray[np.int64]:
+def _triangles(strip: Ints) -> Ints:
     """Triangles (m, 3) of a strip, all turning as its first one does, without those that repeat a vertex."""
-    faces: NDArray[np.int64] = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
+    faces: Ints = np.column_stack([strip[:-2], strip[1:-1], strip[2:]])
     faces[1::2] = faces[1::2, [1, 0, 2]]
     a, b, c = faces.T
     return np.compress((a != b) & (b != c) & (c != a), faces, axis=0)
@@ -227,13 +228,13 @@ def write_glb(
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-def _quantise(centred: Vertices) -> tuple[NDArray[np.int16], float]:
+def _quantise(centred: Floats) -> tuple[NDArray[np.int16], float]:
     """Vertices (n, 3) about 0 as numbers of steps (n, 4), the last 0 to fill 8 bytes, and the step's length, m."""
     step = float(np.abs(centred).max()) / 32767 or 1.0
     return np.pad(np.rint(centred / step), [(0, 0), (0, 1)]).astype("<i2"), step
 
 
-def _strip(sections: int, corners: int, turned: bool) -> NDArray[np.int64]:
+def _strip(sections: int, corners: int, turned: bool) -> Ints:
     """One triangle strip (2 * k * c - 2,) that closes a piece of k sections of c corners, outward.
 
     Numbered ring by ring, it goes from vertex n to n + c, n + 1 and on up the sides as a helix; below the first vertex

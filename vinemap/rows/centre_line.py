@@ -10,9 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Values
 
-    Values = NDArray[np.floating]
 
 TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""

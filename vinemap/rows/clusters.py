@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
-    Values = NDArray[np.floating]
-    Labels = NDArray[np.int64]
+    from vinemap.compute.arrays import Flags, Ints, Values
+
 
 TANGENT_LENGTH = 5.0
 """Metres of a piece's end that tell its tangent."""
@@ -127,11 +127,11 @@ def _linked(
     axis: Values,
     along: Values,
     across: Values,
-    key: Labels,
+    key: Ints,
     wide: int,
-    order: Labels,
-    first: Labels,
-) -> tuple[Labels, NDArray[np.int32], Values]:
+    order: Ints,
+    first: Ints,
+) -> tuple[Ints, NDArray[np.int32], Values]:
     """Numbers of points j > i for each point i of which one lies in the other's ellipse, those points, and distances.
 
     Points are sorted (``order``) into the cells of a grid ``wide`` columns wide, no smaller than the ellipses; those
@@ -171,12 +171,12 @@ class _Ends(NamedTuple):
     """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
 
 
-def _components(graph: csr_array) -> Labels:
-    labels: Labels = connected_components(graph, directed=False)[1].astype(np.int64)
+def _components(graph: csr_array) -> Ints:
+    labels: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
     return labels
 
 
-def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, position: Values) -> _Ends:
+def _ends(xy: Values, direction: Values, spacing: Values, pieces: Ints, position: Values) -> _Ends:
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
     n = 2 * (len(first) - 1)
@@ -203,13 +203,13 @@ def _ends(xy: Values, direction: Values, spacing: Values, pieces: Labels, positi
     return out
 
 
-def _position_along(points: Labels, pieces: Labels, graph: csr_array) -> Values:
+def _position_along(points: Ints, pieces: Ints, graph: csr_array) -> Values:
     """Way in metres (n,) from one end of its piece to each point, along the piece, however it bends.
 
     ``points`` (n,) are the indices of those in the graph that belong to ``pieces`` (n,), all of each piece.
     """
 
-    def way_from(starts: Labels) -> Values:
+    def way_from(starts: Ints) -> Values:
         found: Values = dijkstra(graph, directed=False, indices=points[starts], min_only=True)[points]
         return found
 
@@ -223,7 +223,7 @@ def _like(axis: Values, way: Values) -> Values:
     return axis if axis @ way >= 0 else -axis
 
 
-def _join(pairs: NDArray[np.int64], n_ends: int) -> Labels:
+def _join(pairs: Ints, n_ends: int) -> Ints:
     """Row (m,) of each piece: ends are paired in the order of ``pairs`` (k, 2), each end once."""
     rows = np.arange(n_ends // 2)
     taken = np.zeros(n_ends, dtype=bool)
@@ -232,11 +232,11 @@ def _join(pairs: NDArray[np.int64], n_ends: int) -> Labels:
         if not (taken[a] or taken[b] or one == other):
             taken[[a, b]] = True
             rows[rows == other] = one
-    out: Labels = np.unique(rows, return_inverse=True)[1]
+    out: Ints = np.unique(rows, return_inverse=True)[1]
     return out
 
 
-def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
+def _candidates(ends: _Ends, max_gap: float) -> Ints:
     """Pairs of ends (k, 2) that may belong together, the best first.
 
     The lateral mismatch is measured from the tangents of both ends (the mean of the two vanishes on an arc) and
@@ -259,11 +259,11 @@ def _candidates(ends: _Ends, max_gap: float) -> NDArray[np.int64]:
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
     fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
     cost = length[fits] + 10 * lateral[fits]
-    out: NDArray[np.int64] = pairs[fits][np.argsort(cost, kind="stable")]
+    out: Ints = pairs[fits][np.argsort(cost, kind="stable")]
     return out
 
 
-def _kinked(ends: _Ends, a: Labels, b: Labels, length: Values) -> NDArray[np.bool_]:
+def _kinked(ends: _Ends, a: Ints, b: Ints, length: Values) -> Flags:
     """Whether two ends (k,) could only be joined by a bend that neither of their pieces, where long enough, has."""
     (ax, ay), (bx, by) = ends.tangent[a].T, -ends.tangent[b].T
     turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
@@ -271,11 +271,11 @@ def _kinked(ends: _Ends, a: Labels, b: Labels, length: Values) -> NDArray[np.boo
     known = np.isfinite(bends)
     bend = np.where(known, bends, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     # Tangents are those of the middle of the pieces' last metres.
-    out: NDArray[np.bool_] = known.any(axis=0) & (np.abs(turn - bend * (length + TANGENT_LENGTH)) > KINK)
+    out: Flags = known.any(axis=0) & (np.abs(turn - bend * (length + TANGENT_LENGTH)) > KINK)
     return out
 
 
-def _over_track_or_headland(ends: _Ends, pairs: NDArray[np.int64], xy: Values, track_width: float) -> NDArray[np.bool_]:
+def _over_track_or_headland(ends: _Ends, pairs: Ints, xy: Values, track_width: float) -> Flags:
     """Whether the gap between two ends (k, 2) goes on through the neighbouring rows, three on each side.
 
     It is a track if most of them stand before it and after it, and three in four of those are empty beside it. It is

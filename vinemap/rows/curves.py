@@ -22,9 +22,8 @@ from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import centre_line, half_width, runs_above, whittaker
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Flags, Ints, Values
 
-    Values = NDArray[np.floating]
 
 STATION = 0.1
 """Metres between the stations of a straightened row."""
@@ -92,7 +91,7 @@ def trace_rows(
         key_points["spacing_m"].to_numpy(),
     )
 
-    def trace(members: NDArray[np.int64]) -> tuple[float, float, float, shapely.LineString] | None:
+    def trace(members: Ints) -> tuple[float, float, float, shapely.LineString] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
         between = float(np.median(spacing[members]))
         course = _centred(ordered, cover, between) if len(ordered) > 1 else None
@@ -213,7 +212,7 @@ def _turn(curve: Values) -> float:
     return abs(float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last)))
 
 
-def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
+def _repeated(rows: gpd.GeoDataFrame) -> Flags:
     """Whether a row lies for the most part within a quarter of a spacing of a longer one."""
     lines = rows["simple"].to_numpy()
     out = np.zeros(len(rows), dtype=bool)
@@ -226,7 +225,7 @@ def _repeated(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     return out
 
 
-def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
+def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
     """Whether a row has about as much canopy as most of those that it stands among: no wire between posts, no hedge."""
     out = np.ones(len(rows), dtype=bool)
     beside = coo_array((np.ones(len(pairs := _neighbours(rows))), tuple(pairs.T)), shape=(len(rows), len(rows)))
@@ -243,14 +242,14 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
     return out
 
 
-def _accompanied(rows: gpd.GeoDataFrame) -> NDArray[np.bool_]:
+def _accompanied(rows: gpd.GeoDataFrame) -> Flags:
     """Whether another row of about the same direction lies a spacing from each."""
     out = np.zeros(len(rows), dtype=bool)
     out[_neighbours(rows)[:, 0]] = True
     return out
 
 
-def _neighbours(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
+def _neighbours(rows: gpd.GeoDataFrame) -> Ints:
     """Pairs (k, 2) of rows of about the same direction that lie no more than a spacing apart."""
     lines = rows["simple"].to_numpy()
     if len(rows) < 2:
@@ -262,5 +261,5 @@ def _neighbours(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=BESIDE * spacing)
     beside = (i != j) & (shapely.distance(lines[i], lines[j]) <= BESIDE * np.minimum(spacing[i], spacing[j]))
     parallel = np.abs(np.sin(angle[i] - angle[j])) < np.sin(np.radians(20))
-    out: NDArray[np.int64] = np.column_stack([i, j])[parallel & beside]
+    out: Ints = np.column_stack([i, j])[parallel & beside]
     return out

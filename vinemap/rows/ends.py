@@ -11,9 +11,8 @@ from vinemap.geo.curve import between, way_along
 from vinemap.rows.centre_line import CELL, runs_above
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Values
 
-    Values = NDArray[np.floating]
 
 AROUND = 0.3
 """Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""

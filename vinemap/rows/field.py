@@ -20,9 +20,9 @@ from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, scan_
 
 if TYPE_CHECKING:
     import geopandas as gpd
-    from numpy.typing import NDArray
 
-    Values = NDArray[np.floating]
+    from vinemap.compute.arrays import Ints, Values
+
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
@@ -168,7 +168,7 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
     )
 
 
-def _spacing_beside(here: Values, chord: Values, row: NDArray[np.int64], expected: Values) -> Values:
+def _spacing_beside(here: Values, chord: Values, row: Ints, expected: Values) -> Values:
     """Mean distance in metres (n,) from points of rows to the rows on both sides, NaN where there is none."""
     if len(here) == 0:
         return np.empty(0)

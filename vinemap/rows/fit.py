@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from vinemap.cloud.frame import Taken
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Grid
 
-    Values = NDArray[np.floating]
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
@@ -154,7 +154,7 @@ def _smooth_course(course: Values) -> Values:
 
 def _deal(
     cloud: Cloud, cover: Raster, curves: Sequence[Values], half: Values, low: float, high: float
-) -> Iterator[tuple[NDArray[np.int64], list[_Share]]]:
+) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
     vines = cover.values > 0
 
@@ -184,7 +184,7 @@ def _weigh(
     xyz: Values,
     heights: Values,
     member: NDArray[np.int32],
-    vines: NDArray[np.bool_],
+    vines: Flags,
     grid: Grid,
     limits: tuple[float, float],
     canopy: Values,

@@ -12,11 +12,9 @@ from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import cell_of, sample, sample_across
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Values
     from vinemap.geo.raster import Grid, Raster, RowField
 
-    Values = NDArray[np.floating]
 
 BATCH = 5_000
 SLICES = 3

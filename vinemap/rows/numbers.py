@@ -13,12 +13,11 @@ from vinemap.errors import InputError
 from vinemap.geo.crs import WGS84, Origin, to_main, to_wgs84
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.compute.arrays import Floats, Ints
     from vinemap.geo.raster import Raster
 
-    Values = NDArray[np.float64]
 
 FARTHEST = 50_000.0
 """Metres from the origin of {Main}, a plane that the globe leaves by then."""
@@ -66,13 +65,13 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     )
 
 
-def _chord(line: shapely.LineString) -> Values:
+def _chord(line: shapely.LineString) -> Floats:
     ends = shapely.get_coordinates(line)[[0, -1]]
-    out: Values = ends[1] - ends[0]
+    out: Floats = ends[1] - ends[0]
     return out
 
 
-def _order_across(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
+def _order_across(rows: gpd.GeoDataFrame) -> Ints:
     """Positions of rows in the order of their numbers."""
     lines = rows.geometry.to_numpy()
     middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
@@ -86,7 +85,7 @@ def _order_across(rows: gpd.GeoDataFrame) -> NDArray[np.int64]:
         # Northwards across rows that run rather west–east, eastwards across those that run rather north–south.
         leading = normal[1] if abs(normal[1]) >= abs(normal[0]) else normal[0]
         across[members] = middle[members] @ (normal if leading > 0 else -normal)
-    order: NDArray[np.int64] = np.lexsort((across, block))
+    order: Ints = np.lexsort((across, block))
     return order
 
 
@@ -162,11 +161,11 @@ def _key_points(rows: gpd.GeoDataFrame, labels: list[str], n_points: list[int]) 
     return gpd.GeoDataFrame(table.drop(columns="p"), geometry=gpd.GeoSeries(list(table["p"])), crs=rows.crs)
 
 
-def _length(xyz: Values) -> float:
+def _length(xyz: Floats) -> float:
     return float(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum())
 
 
-def _orientation(xyz: Values) -> float:
+def _orientation(xyz: Floats) -> float:
     """Mean direction in degrees of a curve that runs eastwards, in (-90, 90]."""
     way = np.diff(xyz[:, :2], axis=0)
     chord = np.arctan2(*(xyz[-1, :2] - xyz[0, :2])[::-1])
@@ -175,7 +174,7 @@ def _orientation(xyz: Values) -> float:
     return float(90 - (90 - mean) % 180)
 
 
-def _mean_elevation(xyz: Values) -> float:
+def _mean_elevation(xyz: Floats) -> float:
     step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
     return float(np.average((xyz[1:, 2] + xyz[:-1, 2]) / 2, weights=step))
 
@@ -188,7 +187,7 @@ def corner_of(dtm: Raster) -> Origin:
     return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
 
 
-def check_near(origin: Origin, point: Values, crs: CRS) -> None:
+def check_near(origin: Origin, point: Floats, crs: CRS) -> None:
     """Make sure that an origin of {Main} lies near the cloud, one point (3,) of which is given.
 
     Raises

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Values = NDArray[np.floating]
+    from vinemap.compute.arrays import Ints, Values
+
 
 CYLINDER_TURN = 1.0
 """Degrees between the directions in which a cylinder is sliced."""
@@ -72,7 +73,7 @@ def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float,
     sums = sparse.csr_array(flat, shape=(n * len(angles), len(x)))
     size = np.maximum(sums.sum(axis=1).reshape(len(angles), n), 1.0)
 
-    def waves(batch: NDArray[np.int64]) -> Values:
+    def waves(batch: Ints) -> Values:
         k = np.arange(len(batch))
         histogram = (sums @ windows[batch][:, inside].T).T.reshape(len(batch), len(angles), n) / size
         histogram -= np.average(histogram, axis=2, weights=np.broadcast_to(size, histogram.shape))[:, :, None]
@@ -91,7 +92,7 @@ def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float,
     return _peaks([waves(batch) for batch in batches], occupied, shape)
 
 
-def _windows(cover: Values, half: int, step: float) -> tuple[Values, NDArray[np.int64], tuple[int, int]]:
+def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple[int, int]]:
     """Windows (nodes, 2 half, 2 half) on a grid of nodes (my, mx) from the raster's corner, which are near canopy."""
     size = 2 * half
     stride = max(1, round(step / COVER_RESOLUTION))
@@ -107,7 +108,7 @@ def _windows(cover: Values, half: int, step: float) -> tuple[Values, NDArray[np.
     return windows, np.flatnonzero(canopy[::stride, ::stride][:my, :mx]), (my, mx)
 
 
-def _peaks(waves: Sequence[Values], occupied: NDArray[np.int64], shape: tuple[int, int]) -> Peaks:
+def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> Peaks:
     out = np.zeros((3, shape[0] * shape[1]))
     out[:2] = np.nan
     if waves:

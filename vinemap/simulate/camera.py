@@ -13,10 +13,8 @@ from vinemap.errors import DependencyError, InputError
 from vinemap.odometry.poses import Pose
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Image, Values
 
-    Array = NDArray[np.floating]
-    Image = NDArray[np.uint8]
 
 LOW = Camera(width=320, height=240, fx=299.4303, fy=299.4122, above_ground_mm=245.0, x_mm=950.0)
 HIGH = Camera(width=1280, height=720, fx=888.8749, fy=888.5340, above_ground_mm=245.0, x_mm=950.0)
@@ -38,7 +36,7 @@ class Ground(NamedTuple):
 
     image: Image
     """Grey levels (ny, nx), :data:`RESOLUTION` mm apart, the first row at the top."""
-    relief: Array | None = None
+    relief: Values | None = None
     """Height above the plane in mm, of the same shape."""
 
 
@@ -142,7 +140,7 @@ def straight(*, length_mm: float = 9600.0, step_mm: float = 61.0, heading_deg: f
     return [Pose(float(s * np.cos(a)), float(s * np.sin(a)), heading_deg) for s in steps]
 
 
-def above(place: Array, heading_deg: float, *, camera: Camera = LOW) -> Pose:
+def above(place: Values, heading_deg: float, *, camera: Camera = LOW) -> Pose:
     """Pose of a robot whose camera, straight ahead of it, is above a place (2,)."""
     a = np.radians(heading_deg)
     x, y = place - camera.x_mm * np.array([np.cos(a), np.sin(a)])
@@ -168,14 +166,14 @@ def wander(
 
 
 @lru_cache(maxsize=4)
-def _rays(camera: Camera) -> tuple[Array, Array]:
+def _rays(camera: Camera) -> tuple[Values, Values]:
     """Directions of a camera's rays, forward and to the left over downward, some for each pixel."""
     import cv2
 
     n = max(1, round(camera.above_ground_mm / camera.fx / RAY))
     columns = (np.arange(camera.width * n) + 0.5) / n - 0.5
     rows = (np.arange(camera.height * n) + 0.5) / n - 0.5
-    points: Array = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
+    points: Values = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
     if camera.distortion:
         lens = np.array(camera.distortion)
         points = np.asarray(cv2.undistortPoints(points, camera.matrix, lens, P=camera.matrix), float)
@@ -184,7 +182,9 @@ def _rays(camera: Camera) -> tuple[Array, Array]:
     return forward.reshape(shape), left.reshape(shape)
 
 
-def _seen(ground: Ground, pose: Pose, camera: Camera, rays: tuple[Array, Array], height: Array) -> tuple[Array, Array]:
+def _seen(
+    ground: Ground, pose: Pose, camera: Camera, rays: tuple[Values, Values], height: Values
+) -> tuple[Values, Values]:
     """Columns and rows of the ground where rays are at a height."""
     a = np.radians(pose.heading_deg)
     left = camera.above_ground_mm - height
@@ -195,7 +195,7 @@ def _seen(ground: Ground, pose: Pose, camera: Camera, rays: tuple[Array, Array],
     return columns.astype(np.float32), rows.astype(np.float32)
 
 
-def _photograph(name: str) -> Array:
+def _photograph(name: str) -> Values:
     try:
         from skimage import data
     except ImportError as error:
@@ -203,7 +203,7 @@ def _photograph(name: str) -> Array:
     return getattr(data, name)().astype(np.float32)  # type: ignore[no-any-return]
 
 
-def _file(path: Path) -> Array:
+def _file(path: Path) -> Values:
     import cv2
 
     try:
@@ -219,7 +219,7 @@ def _file(path: Path) -> Array:
     return image.astype(np.float32)
 
 
-def _pieces(photograph: Array, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+def _pieces(photograph: Values, shape: tuple[int, int], rng: np.random.Generator) -> Values:
     import cv2
 
     mean, half = photograph.mean(), PIECE // 2
@@ -243,20 +243,20 @@ def _pieces(photograph: Array, shape: tuple[int, int], rng: np.random.Generator)
             total[where] += (weight * (piece - mean))[cut][: room[0], : room[1]]
             squares[where] += (weight * weight)[cut][: room[0], : room[1]]
     inner = np.s_[PIECE : PIECE + shape[0], PIECE : PIECE + shape[1]]
-    out: Array = mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
+    out: Values = mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
     return out
 
 
-def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Array:
+def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Values:
     """Gaussian noise of unit variance, smooth."""
     import cv2
 
     values = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma))
-    out: Array = (values - values.mean()) / values.std()
+    out: Values = (values - values.mean()) / values.std()
     return out
 
 
-def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Values:
     """Ground of noise: each layer's size of grain in mm, contrast in grey levels, and how sharp its edges are."""
     layers = {
         "soil": ((0.5, 9, 1), (1.5, 12, 3), (4.0, 12, 2), (12.0, 8, 1)),

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from vinemap.compute.arrays import Image
     from vinemap.config.camera import Camera
-    from vinemap.simulate.camera import Ground, Image
+    from vinemap.simulate.camera import Ground
 
     Step = tuple[Image, Image, Pose]
     """Two frames and the movement between them."""

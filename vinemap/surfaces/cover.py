@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Flags, Values
 
-    Values = NDArray[np.floating]
     Counts = NDArray[np.uint16]
 
 BATCH = 1_000_000
@@ -88,7 +88,7 @@ def _count(
             counts[2, cell] += 1
 
 
-def _no_vines(everything: Counts, canopy: Counts, tall: Counts, resolution: float) -> NDArray[np.bool_]:
+def _no_vines(everything: Counts, canopy: Counts, tall: Counts, resolution: float) -> Flags:
     """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them.
 
     Parameters are counts (ny, nx) of all points, of those at the canopy's heights and of those above.
@@ -100,12 +100,12 @@ def _no_vines(everything: Counts, canopy: Counts, tall: Counts, resolution: floa
     mass = low + above
     high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
     wide = binary_opening(mass > 0.5 * np.maximum(all_, 1), _disc(WIDEST / 2, cell))
-    out: NDArray[np.bool_] = binary_dilation(high | wide, _disc(0.5, cell))
+    out: Flags = binary_dilation(high | wide, _disc(0.5, cell))
     return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
 
 
-def _disc(radius: float, cell: float) -> NDArray[np.bool_]:
+def _disc(radius: float, cell: float) -> Flags:
     """Cells whose centre lies within a radius of the middle one's."""
     n = int(radius / cell)
-    out: NDArray[np.bool_] = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell <= radius
+    out: Flags = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell <= radius
     return out

@@ -20,11 +20,9 @@ from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
 from vinemap.surfaces.statistics import cells_a_block, order_statistics
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Floats
 
-    Values = NDArray[np.float64]
 
 GROUND = 2
 """ASPRS class of ground."""
@@ -39,10 +37,10 @@ FEW = 6.0
 class _Cells(NamedTuple):
     """Order statistics of the heights in each cell (ny, nx): counts, and quantiles where there are points."""
 
-    n: Values
-    low: Values
-    middle: Values
-    high: Values
+    n: Floats
+    low: Floats
+    middle: Floats
+    high: Floats
 
 
 def terrain_model(
@@ -129,7 +127,7 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
     return Raster(surface + reference, grid, cloud.crs)
 
 
-def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Values:
+def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Floats:
     """Terrain (ny, nx) that cells tell, in their own heights."""
     noise = _noise(cells, quantile)
     level = cells.low - noise * _depth(cells.n, quantile) * _soil_share(cells, noise, quantile)
@@ -146,7 +144,7 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
     return multiscale_fit(level, weight * terrain, 0.3 / resolution)
 
 
-def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Values:
+def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Floats:
     """Smooth surface through the low parts of blocks of cells, blind to what stands on them or floats below."""
     low, high = cloud.extent
     reference = float(np.round((low[2] + high[2]) / 2))
@@ -169,14 +167,14 @@ def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Values:
     return surface + trend + reference
 
 
-def _depth(n: Values, quantile: float) -> Values:
+def _depth(n: Floats, quantile: float) -> Floats:
     """Expected order statistic of n standard normal heights (Blom 1958)."""
     rank = np.maximum(np.ceil(quantile * n), 1)
-    out: Values = ndtri((rank - 0.375) / (np.maximum(n, 1) + 0.25))
+    out: Floats = ndtri((rank - 0.375) / (np.maximum(n, 1) + 0.25))
     return out
 
 
-def _soil_share(cells: _Cells, noise: float, quantile: float) -> Values:
+def _soil_share(cells: _Cells, noise: float, quantile: float) -> Floats:
     """How much of the noise's depth lies between a cell's low quantile and its soil: 1 on bare soil, below 0 in weeds.
 
     Heights in weeds are taken as even from the soil up, blurred by the noise: the taller the weeds, the wider the
@@ -197,9 +195,9 @@ def _soil_share(cells: _Cells, noise: float, quantile: float) -> Values:
     return np.where(spread < WEEDS, share, 1.0)
 
 
-def _ramp(x: Values) -> Values:
+def _ramp(x: Floats) -> Floats:
     """Integral of the standard normal distribution function."""
-    out: Values = x * ndtr(x) + np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    out: Floats = x * ndtr(x) + np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
     return out
 
 

@@ -11,9 +11,8 @@ from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import block_sum
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from vinemap.compute.arrays import Flags, Floats
 
-    Values = NDArray[np.float64]
 
 NARROWEST = 1.2
 """Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
@@ -21,7 +20,7 @@ RIDGE = 0.02
 """Weight that holds a local plane to the coarser surface where cells are few."""
 
 
-def quadratic_trend(level: Values, held: NDArray[np.bool_]) -> Values:
+def quadratic_trend(level: Floats, held: Flags) -> Floats:
     """Quadratic surface (ny, nx) through the levels of those cells that hold points, fitted robustly."""
     ny, nx = level.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
@@ -34,11 +33,11 @@ def quadratic_trend(level: Values, held: NDArray[np.bool_]) -> Values:
         coefficients = np.linalg.lstsq(design * root[:, None], low * root, rcond=None)[0]
         off = np.abs(low - design @ coefficients)
         weight = 1 / (1 + (off / (0.1 + 2 * np.median(off))) ** 2)
-    out: Values = terms @ coefficients
+    out: Floats = terms @ coefficients
     return out
 
 
-def multiscale_fit(level: Values, weight: Values, sigma: float) -> Values:
+def multiscale_fit(level: Floats, weight: Floats, sigma: float) -> Floats:
     """Local planes of width sigma (cells), held to ever wider ones where cells lack."""
     surface = np.zeros_like(level)
     for scale in (9.0, 3.0, 1.0):
@@ -46,7 +45,7 @@ def multiscale_fit(level: Values, weight: Values, sigma: float) -> Values:
     return surface
 
 
-def _decimated_fit(level: Values, weight: Values, sigma: float) -> Values:
+def _decimated_fit(level: Floats, weight: Floats, sigma: float) -> Floats:
     """:func:`_plane_fit` for wide planes on blocks of cells, brought back to the cells."""
     k = int(sigma / NARROWEST)
     if k < 2:
@@ -63,7 +62,7 @@ def _decimated_fit(level: Values, weight: Values, sigma: float) -> Values:
     return wide
 
 
-def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
+def _plane_fit(level: Floats, weight: Floats, sigma: float) -> Floats:
     """Value at each cell of the weighted local plane through levels (ny, nx): first-order local regression."""
     radius = int(np.ceil(2.5 * sigma))
     t = np.arange(-radius, radius + 1) / sigma
@@ -75,9 +74,9 @@ def _plane_fit(level: Values, weight: Values, sigma: float) -> Values:
     wanted = [(weight, 0, 0), (weight, 1, 0), (weight, 0, 1), (weight, 2, 0), (weight, 1, 1), (weight, 0, 2)]
     wanted += [(values, 0, 0), (values, 1, 0), (values, 0, 1)]
 
-    def moment(of: tuple[Values, int, int]) -> Values:
-        down: Values = correlate1d(of[0], kernels[of[1]], axis=0, mode="constant")
-        out: Values = correlate1d(down, kernels[of[2]], axis=1, mode="constant")
+    def moment(of: tuple[Floats, int, int]) -> Floats:
+        down: Floats = correlate1d(of[0], kernels[of[1]], axis=0, mode="constant")
+        out: Floats = correlate1d(down, kernels[of[2]], axis=1, mode="constant")
         return out
 
     w, wi, wj, wii, wij, wjj, z, zi, zj = in_threads(moment, wanted)

@@ -10,11 +10,9 @@ from vinemap.cloud.bins import quantiles_in
 from vinemap.geo.raster import Grid, Raster, above, window
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Floats
 
-    Values = NDArray[np.float64]
 
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
@@ -32,7 +30,7 @@ def block_side(resolution: float) -> float:
 
 def order_statistics(
     cloud: Cloud, surface: Raster | None, grid: Grid, quantiles: tuple[float, ...], *, blocks: int = 1
-) -> tuple[Values, Values]:
+) -> tuple[Floats, Floats]:
     """Counts and quantiles of the heights above a surface, or else above ground, in blocks of a grid's cells."""
     shape = [side // blocks for side in grid.shape]
     n, found = np.zeros(shape), np.zeros((len(quantiles), *shape))

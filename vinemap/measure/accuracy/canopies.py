@@ -15,14 +15,13 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import pandas as pd
-    from numpy.typing import NDArray
 
     from vinemap.canopy.model import CanopyModel
+    from vinemap.compute.arrays import Floats
     from vinemap.parcel import RowMap
     from vinemap.simulate.plants import Foliage
     from vinemap.simulate.survey import Survey
 
-    Array = NDArray[np.float64]
 
 SLAB = 0.4
 """Metres along a row over which the true foliage is averaged."""
@@ -33,18 +32,18 @@ NEAR = 0.15
 class CanopyErrors(NamedTuple):
     """What is wrong with the canopies of a map, or of several."""
 
-    good: Array
+    good: Floats
     """G (m,) of sections against the true foliage, leaves' reach included (Table 3.1)."""
-    under: Array
-    over: Array
-    hull_over: Array
+    under: Floats
+    over: Floats
+    hull_over: Floats
     """O (m,) against the outline that the points tell."""
-    soil: Array
+    soil: Floats
     """G − U − O (m,) of the thesis's polygons, whose feet stand on the soil, against the true foliage."""
-    height: Array
+    height: Floats
     """Error (rows,) of the mean height in metres."""
-    width: Array
-    volume: Array
+    width: Floats
+    volume: Floats
     """Error (rows,) of the foliage's volume, as a share of it."""
 
 
@@ -91,17 +90,17 @@ def pool_canopies(errors: Sequence[CanopyErrors]) -> CanopyErrors:
     return CanopyErrors(*(np.concatenate(values) for values in zip(*errors, strict=True)))
 
 
-def _slabs(foliage: Foliage) -> Array:
+def _slabs(foliage: Foliage) -> Floats:
     """Mean outlines of the foliage in slabs as long as sections are, at every station."""
     outlines = foliage_outlines(foliage)
     near = [np.roll(np.arange(len(outlines)), step) for step in (-2, -1, 0, 1, 2)]
     beside = [np.hypot(*(foliage.xy[other] - foliage.xy).T) < SLAB / 2 + 0.05 for other in near]
     total = np.sum([outlines[o] * b[:, None, None] for o, b in zip(near, beside, strict=True)], axis=0)
-    mean: Array = total / np.sum(beside, axis=0)[:, None, None]
+    mean: Floats = total / np.sum(beside, axis=0)[:, None, None]
     return mean
 
 
-def _against_truth(foliage: Foliage, outlines: Array, model: CanopyModel) -> tuple[Array, Array, Array]:
+def _against_truth(foliage: Foliage, outlines: Floats, model: CanopyModel) -> tuple[Floats, Floats, Floats]:
     canopy = model.at
     distance, nearest = cKDTree(foliage.xy).query(canopy.origin[:, :2])
     known = distance < NEAR
@@ -116,9 +115,9 @@ def _against_truth(foliage: Foliage, outlines: Array, model: CanopyModel) -> tup
     return np.asarray(good), np.asarray(under), np.asarray(over)
 
 
-def _true_volumes(survey: Survey) -> Array:
+def _true_volumes(survey: Survey) -> Floats:
     """Volume (rows,) of the foliage in m³, leaves' reach included."""
     area = shapely.area(shapely.polygons(foliage_outlines(survey.foliage)))
     weights = area * survey.foliage.step
-    out: Array = np.bincount(survey.foliage.row, weights=weights, minlength=len(survey.rows)).astype(float)
+    out: Floats = np.bincount(survey.foliage.row, weights=weights, minlength=len(survey.rows)).astype(float)
     return out

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.compute.arrays import Flags, Floats
     from vinemap.parcel import RowMap
     from vinemap.simulate.survey import Survey
 
-    Array = NDArray[np.float64]
 
 NEAR = 0.8
 """Metres within which a gap and a dead vine belong together."""
@@ -36,17 +36,17 @@ class Errors(NamedTuple):
     found: int
     pairs: pd.DataFrame
     """The pairs of :func:`vinemap.evaluate.rows.evaluate_rows`."""
-    terrain: Array
+    terrain: Floats
     """|error| of the DTM (m) at random points of the parcels."""
-    direction: Array
+    direction: Floats
     """|error| of the row direction (degrees) every metre of the true rows."""
-    spacing: Array
+    spacing: Floats
     """|error| of the inter-row spacing, as a share of it, every metre of the true rows that have a neighbour."""
-    recalled: NDArray[np.bool_]
+    recalled: Flags
     """Whether a dead vine with a dead neighbour lies by a gap."""
-    right: NDArray[np.bool_]
+    right: Flags
     """Whether a long gap lies by such a vine."""
-    gap_length: Array
+    gap_length: Floats
     """|error| of the length (m) of gaps of two vines or more."""
 
 
@@ -94,7 +94,7 @@ def pool(errors: Sequence[Errors]) -> Errors:
     return Errors(sum(rows), sum(found), pd.concat(pairs), *(np.concatenate(values) for values in arrays))
 
 
-def _terrain_errors(survey: Survey, dtm: Raster, *, n: int = 4000) -> Array:
+def _terrain_errors(survey: Survey, dtm: Raster, *, n: int = 4000) -> Floats:
     inside = shapely.union_all(survey.parcels.geometry.to_numpy())
     west, south, east, north = inside.bounds
     x, y = np.random.default_rng(0).uniform([west, south], [east, north], (n, 2)).T
@@ -102,7 +102,7 @@ def _terrain_errors(survey: Survey, dtm: Raster, *, n: int = 4000) -> Array:
     return np.abs(sample(dtm, np.column_stack([x, y])) - survey.terrain(x, y))
 
 
-def _field_errors(rows: NDArray[np.object_], field: RowField) -> tuple[Array, Array]:
+def _field_errors(rows: NDArray[np.object_], field: RowField) -> tuple[Floats, Floats]:
     """Errors of direction (degrees) and spacing (shares) every metre of rows; where the field is unknown, the worst."""
     along = [np.arange(0.5, row.length, 1.0) for row in rows]
     row = np.repeat(np.arange(len(rows)), [len(a) for a in along])
@@ -123,7 +123,7 @@ def _field_errors(rows: NDArray[np.object_], field: RowField) -> tuple[Array, Ar
     return np.nan_to_num(direction, nan=90.0), np.nan_to_num(spacing, nan=1.0)[np.isfinite(wanted)]
 
 
-def _true_spacing(rows: NDArray[np.object_], row: NDArray[np.intp], xy: Array, way: Array) -> Array:
+def _true_spacing(rows: NDArray[np.object_], row: NDArray[np.intp], xy: Floats, way: Floats) -> Floats:
     """Distance (m) across the rows to the neighbours, the mean of both sides; NaN where there is none."""
     normal = np.column_stack([-way[:, 1], way[:, 0]])
     others = np.array([shapely.MultiLineString(list(np.delete(rows, i))) for i in range(len(rows))], dtype=object)
@@ -136,11 +136,11 @@ def _true_spacing(rows: NDArray[np.object_], row: NDArray[np.intp], xy: Array, w
     usual = quantile(distance[np.isfinite(distance)], 0.5)
     known = distance < 1.5 * usual
     total = np.where(known, distance, 0).sum(axis=0)
-    out: Array = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+    out: Floats = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
     return out
 
 
-def _gap_errors(survey: Survey, gaps: gpd.GeoDataFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
+def _gap_errors(survey: Survey, gaps: gpd.GeoDataFrame) -> tuple[Flags, Flags, Floats]:
     """Recall of dead vines in runs, precision of long gaps, errors of the runs' lengths (m)."""
     dead = survey.dead_vines
     runs = ((dead["vine"].diff() != 1) | (dead["row"].diff() != 0)).cumsum()

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     import shapely
     from numpy.typing import NDArray
 
+    from vinemap.compute.arrays import Floats
     from vinemap.geo.raster import Raster
     from vinemap.parcel import RowMap
 
-    Array = NDArray[np.float64]
 
 T = TypeVar("T")
 CANOPY = (0.5, 2.9)
@@ -54,7 +54,7 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
 
     xyz, found = mapped(cloud, boundary)
 
-    def filtered() -> Array:
+    def filtered() -> Floats:
         csf = CSF.CSF()
         csf.params.cloth_resolution = 0.5
         csf.params.class_threshold = 0.2
@@ -63,7 +63,7 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
         csf.setPointCloud(xyz)
         inside, outside = CSF.VecInt(), CSF.VecInt()
         csf.do_filtering(inside, outside, False)  # noqa: FBT003 - it knows no keywords
-        soil: Array = xyz[np.array(inside)]
+        soil: Floats = xyz[np.array(inside)]
         return soil
 
     before = held_now()
@@ -86,7 +86,7 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
     }
 
 
-def rasterised(soil: Array, like: Raster) -> Raster:
+def rasterised(soil: Floats, like: Raster) -> Raster:
     """Means of ground points (n, 3) in the cells of a raster, the empty ones filled from around."""
     from rasterio.fill import fillnodata
 
@@ -114,7 +114,7 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     heights = xyz[:, 2] - sample(found.dtm, xyz[:, :2])
     canopy = xyz[(heights > CANOPY[0]) & (heights < CANOPY[1]), :2]
 
-    def clustered() -> tuple[Array, NDArray[np.intp]]:
+    def clustered() -> tuple[Floats, NDArray[np.intp]]:
         some = (
             np.unique(np.floor(canopy / thin).astype(np.int64), axis=0, return_index=True)[1] if thin else slice(None)
         )
@@ -142,7 +142,7 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     }
 
 
-def course(xy: Array, *, step: float = 2.0) -> shapely.LineString | None:
+def course(xy: Floats, *, step: float = 2.0) -> shapely.LineString | None:
     """Line through a cluster (n, 2): the middles of pieces of ``step`` m along its longest axis, None of no length."""
     import shapely
 
@@ -193,7 +193,7 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
     }
 
 
-def mapped(cloud: str, boundary: str) -> tuple[Array, RowMap]:
+def mapped(cloud: str, boundary: str) -> tuple[Floats, RowMap]:
     """Points (n, 3) of a parcel, and its rows as they come."""
     from vinemap.cloud.las import read_cloud
     from vinemap.config.settings import Settings

@@ -18,9 +18,6 @@ from vinemap.measure.bench.surveys import estate, survey
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
 
 MEMORY = 0.75
 """Share of the machine's memory that a job may address."""

@@ -11,11 +11,10 @@ import numpy as np
 
 if TYPE_CHECKING:
     import shapely
-    from numpy.typing import NDArray
 
+    from vinemap.compute.arrays import Floats
     from vinemap.simulate.plants import Terrain, Vineyard
 
-    Array = NDArray[np.float64]
 
 DENSITY = 500.0
 """Rays a square metre of the parcel; a tenth of them finds neither leaf nor ground."""
@@ -29,7 +28,7 @@ MARGIN = 13.0
 class Plot(NamedTuple):
     """A vineyard like the thesis's parcel F, of any size."""
 
-    rows: list[Array]
+    rows: list[Floats]
     vineyard: Vineyard
     terrain: Terrain
 
@@ -59,7 +58,7 @@ def margin_of(millions: float) -> float:
     return MARGIN * min(1.0, math.sqrt(millions / 4.7))
 
 
-def outline(rows: list[Array], margin: float) -> shapely.Polygon:
+def outline(rows: list[Floats], margin: float) -> shapely.Polygon:
     """Parcel of rows and the bare ground about them (m)."""
     import shapely
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from vinemap.measure.odometry.trials import Array, ByMethod, Drift, Errors, Size
+    from vinemap.compute.arrays import Values
+    from vinemap.measure.odometry.trials import ByMethod, Drift, Errors, Size
 
     Panel = Callable[[Axes], None]
 
@@ -42,7 +43,7 @@ def save(panels: Sequence[Sequence[Panel]], path: Path, *, width: float = 5.0, h
     figure.savefig(path, dpi=90)
 
 
-def boxes(axes: Axes, values: Mapping[str, Array], what: str) -> None:
+def boxes(axes: Axes, values: Mapping[str, Values], what: str) -> None:
     """Boxes from quarter to quarter, whiskers from 5% to 95%, on a logarithmic scale."""
     names = [NAMES.get(name, name) for name in values]
     shown = [np.maximum(errors, FINEST) for errors in values.values()]

@@ -21,15 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
+    from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
     from vinemap.odometry.refinement import Method
     from vinemap.odometry.step import Strategy
-    from vinemap.simulate.camera import Image
     from vinemap.simulate.steps import Step
 
-    Array = NDArray[np.floating]
     Follower = Callable[[Sequence[Image]], Pose]
     """Movement from the first frame of a path to its last."""
 
@@ -51,19 +48,19 @@ FAILURE = 5.0
 class Errors(NamedTuple):
     """What is wrong with steps."""
 
-    offset: Array
+    offset: Values
     """Error (n, 2) of the template's place in mm, forward and to the left."""
-    turn: Array
+    turn: Values
     """|error| (n,) of the rotation in degrees (Eq. 14)."""
-    flagged: NDArray[np.bool_]
+    flagged: Flags
 
     @property
-    def place(self) -> Array:
+    def place(self) -> Values:
         """|error| (n,) of the template's place in mm (Eq. 13)."""
         return np.asarray(np.hypot(*self.offset.T))
 
     @property
-    def wrong(self) -> NDArray[np.bool_]:
+    def wrong(self) -> Flags:
         """Whether a step is lost (n,)."""
         return np.asarray(self.place > FAILURE)
 
@@ -79,7 +76,7 @@ class Losses(NamedTuple):
     contrast: float
     """Standard deviation of its frames in grey levels, their mean."""
     steps: Errors
-    unrelated: NDArray[np.bool_]
+    unrelated: Flags
     """Whether two frames of different ground are flagged."""
     beyond: Errors
 
@@ -103,13 +100,13 @@ class Size(NamedTuple):
 class Drift(NamedTuple):
     """Error at the end of paths over their length."""
 
-    place: Array
+    place: Values
     """Millimetres a metre (n,)."""
-    turn: Array
+    turn: Values
     """Degrees a metre (n,)."""
 
 
-def template_offset(movement: Pose, truth: Pose, camera: Camera) -> Array:
+def template_offset(movement: Pose, truth: Pose, camera: Camera) -> Values:
     """Millimetres (2,) in the next frame from where the middle of a frame is to where it is found."""
     x, y = camera.ground(camera.width // 2, camera.height // 2)
     found, true = (moved(step, Pose(x, y, 0.0)) for step in (movement, truth))
@@ -131,7 +128,7 @@ def measure(
     steps: Iterable[Step], methods: Sequence[Method] = METHODS, *, template_share: float = 0.2
 ) -> dict[Method, Errors]:
     """Errors of methods on the same steps."""
-    found: dict[Method, list[tuple[Array, float, bool]]] = {method: [] for method in methods}
+    found: dict[Method, list[tuple[Values, float, bool]]] = {method: [] for method in methods}
     for frame, next_frame, truth in steps:
         for method, errors in found.items():
             motion = estimate_motion(frame, next_frame, camera=LOW, method=method, template_share=template_share)
