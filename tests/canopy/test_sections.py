@@ -26,7 +26,6 @@ from vinemap.canopy.peeling import peel_sections
 from vinemap.canopy.points import NO_SECTIONS, Sections, join
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.points import PointCloud
-from vinemap.config.settings import Settings
 from vinemap.geo.raster import Grid, Raster
 from vinemap.surfaces.ground import terrain_model
 
@@ -284,7 +283,7 @@ points_of = st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-0.3, 3)), max_si
 def test_any_sections_give_a_defined_model(sections):
     """Sections without points, with three, on a line, of one point many times, of one side only."""
     points = [np.array(p, dtype=float).reshape(-1, 2) for p in sections]
-    model = model_sections(separate(many_sections(points)), Settings(), UTM)
+    model = model_sections(separate(many_sections(points)), UTM)
     assert len(model.polygons) == len(model.table) == len(model.at.row_id)
     assert np.isfinite(model.polygons).all()
     assert np.isfinite(model.table.drop(columns="geometry").to_numpy()).all()
@@ -295,7 +294,7 @@ def test_any_sections_give_a_defined_model(sections):
 def test_a_million_points_in_a_section():
     rng = np.random.default_rng(0)
     crowd = np.column_stack([rng.normal(0, 0.15, 1_000_000), rng.uniform(0.5, 2, 1_000_000)])
-    model = model_sections(separate(many_sections([crowd, crowd[:200]])), Settings(), UTM)
+    model = model_sections(separate(many_sections([crowd, crowd[:200]])), UTM)
     assert model.table["n_points"].max() > 900_000
     assert model.table["height_m"].iloc[0] == pytest.approx(1.98, abs=0.01)
 
@@ -304,6 +303,6 @@ def test_a_row_shorter_than_a_step():
     xyz = np.column_stack([np.random.default_rng(0).uniform([0, -0.2, 0.5], [0.1, 0.2, 2], (500, 3))])
     rows = rows_frame([np.array([[0, 0], [0.1, 0]])])
     sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
-    model = model_sections(separate(sections), Settings(), UTM)
+    model = model_sections(separate(sections), UTM)
     assert len(model.table) == 2
     assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1

@@ -13,7 +13,8 @@ import shapely.ops
 from click.testing import CliRunner
 
 from vinemap.geo.raster import Grid, Raster, RowField
-from vinemap.measure.accuracy.__main__ import main, measure
+from vinemap.measure.accuracy.__main__ import main
+from vinemap.measure.accuracy.family import measure
 from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, table
 from vinemap.measure.accuracy.rows import compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill

@@ -14,35 +14,12 @@ from pathlib import Path
 
 import click
 
-from vinemap.cloud.points import PointCloud
-from vinemap.config.settings import PolygonOptions, Settings
-from vinemap.measure.accuracy.canopies import CanopyErrors, compare_canopies, pool_canopies
+from vinemap.measure.accuracy.family import measure
 from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, table
-from vinemap.measure.accuracy.pictures import draw
-from vinemap.measure.accuracy.rows import Errors, compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill
-from vinemap.parcel import map_rows, model_canopies
-from vinemap.simulate.families import FAMILIES, family
+from vinemap.simulate.families import FAMILIES
 
 PROCESSES = 2
-
-
-def measure(name: str, seeds: int, out: Path | None = None) -> tuple[Errors, CanopyErrors]:
-    """Errors over all seeds of a family; draws its worst row into a folder."""
-    cases, canopies = [], []
-    ours, thesis = Settings(), Settings(polygon=PolygonOptions(foot="soil"))
-    for seed in range(seeds):
-        survey = family(name, seed)
-        points = PointCloud(survey.xyz, survey.rows.crs)
-        found = map_rows(points, ours)
-        errors, worst = compare(survey, found)
-        model, on_soil = (model_canopies(found, settings) for settings in (ours, thesis))
-        canopies.append(compare_canopies(survey, found, model, on_soil, errors.pairs, step=ours.sections.step))
-        cases.append((errors, worst, survey, found, f"{name}, seed {seed}"))
-    if out:
-        _, worst, survey, found, title = max(cases, key=lambda case: case[1].badness if case[1] else 0.0)
-        draw(worst, survey, found, title, out / f"{name}.png")
-    return pool([errors for errors, *_ in cases]), pool_canopies(canopies)
 
 
 @click.command()
