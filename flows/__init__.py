@@ -1,4 +1,4 @@
-"""Prefect flows that chain the stages of vinemap."""
+"""The chain and the jobs as Prefect flows."""
 
 import logging
 import os

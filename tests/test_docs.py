@@ -1,5 +1,6 @@
 """The documentation says what is so: its links, commands, columns and defaults."""
 
+import ast
 import re
 import shutil
 from pathlib import Path
@@ -93,3 +94,40 @@ def test_the_library_in_twenty_lines(tmp_path, monkeypatch, vineyard):
     assert len(names["rows"]) == len(vineyard.rows)
     assert (tmp_path / "rows.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "canopies.glb").read_bytes().startswith(b"glTF")
+
+
+SOURCES = sorted(path for path in (ROOT / "vinemap").rglob("*.py") if "node_modules" not in path.parts)
+
+
+def defined(path):
+    """Names that a module defines at its top, and those within its classes."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    named = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef | ast.FunctionDef)]
+    assigned = [name.id for node in tree.body for name in ast.walk(node) if isinstance(name, ast.Name)]
+    return {node.name for node in named} | set(assigned)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_references_lead_somewhere(path):
+    for target in re.findall(r":(?:func|class|data|meth|mod):`([\w.]+)`", path.read_text(encoding="utf-8")):
+        *place, name = target.split(".")
+        if place[:1] != ["vinemap"]:
+            assert name in defined(path), target
+            continue
+        words = iter(place + [name])
+        here = ROOT
+        while here.is_dir() and (word := next(words, None)):
+            here = here / word if (here / word).is_dir() else here / f"{word}.py"
+        rest = next(words, None)
+        if here.is_dir() or rest is None:
+            assert here.exists(), target
+        elif here.is_file():
+            assert rest in defined(here), target
+        else:
+            assert here.stem in defined(here.parent / "__init__.py"), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_pages_name_exist(page):
+    named = re.findall(r"`((?:vinemap|tests|flows|configs)/[\w./-]+)`", page.read_text(encoding="utf-8"))
+    assert [name for name in named if not (ROOT / name).exists()] == []

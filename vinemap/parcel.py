@@ -24,11 +24,12 @@ from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.config.names import check_name
 from vinemap.config.settings import Settings
+from vinemap.geo.crs import check_near, corner_of
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.pages.parcel import write_page
 from vinemap.product.recipe import Recipe, recipe_of
-from vinemap.product.record import run_record
+from vinemap.product.record import record_of
 from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
 from vinemap.rows.blocks import group_blocks
@@ -39,7 +40,7 @@ from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
 from vinemap.rows.missing import count_missing
-from vinemap.rows.numbers import check_near, corner_of, describe_rows, number_rows
+from vinemap.rows.numbers import describe_rows, number_rows
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
@@ -57,7 +58,8 @@ if TYPE_CHECKING:
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.crs import Origin
-    from vinemap.geo.raster import Raster, RowField
+    from vinemap.geo.raster import Raster
+    from vinemap.rows.waves import RowField
 
 T = TypeVar("T")
 
@@ -93,10 +95,10 @@ class Summary(NamedTuple):
     def line(self) -> str:
         """The same as a sentence."""
         remarks = "".join(f"; {warning}" for warning in self.warnings)
-        return f"{self.parcel}: {found(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
+        return f"{self.parcel}: {in_words(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
 
 
-def found(rows: int, length: float) -> str:
+def in_words(rows: int, length: float) -> str:
     """In words, so many rows of so many metres in all."""
     return f"{rows} rows, {length:,.0f} m" if rows else "no vine row found"
 
@@ -282,7 +284,7 @@ def follow(
 
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        record = run_record(recipe, points, layers, seen.chm, origin=origin, n_key_points=seen.n_key_points)
+        record = record_of(recipe, points, layers, seen.chm, origin=origin, n_key_points=seen.n_key_points)
         record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {

@@ -6,8 +6,6 @@ from pyproj import CRS
 
 from vinemap.cloud.frame import points_of_rows
 from vinemap.cloud.points import PointCloud
-from vinemap.geo.curve import between, extend, resample, way_along
-from vinemap.rows.centre_line import runs_above, whittaker
 
 
 def row_coordinates(xyz, curves, reach):
@@ -41,42 +39,3 @@ def test_points_go_to_the_nearest_row():
     y = xyz[near.member, 1]
     assert (y[: near.start[1]] < 1.13).all()
     assert (y[near.start[1] :] > 0.87).all()
-
-
-def test_lengths_ends_and_parts():
-    curve = np.array([[0, 0], [3, 4.0], [3, 10]])
-    assert list(way_along(curve)) == [0, 5, 11]
-    assert way_along(extend(curve, 2))[-1] == pytest.approx(15)
-    assert len(resample(curve, 0.5)) == 23
-    assert resample(curve, 0.5)[[0, -1]].tolist() == [[0, 0], [3, 10]]
-    assert between(curve, 5, 8).tolist() == [[3, 4], [3, 7]]
-
-
-def test_runs_above_a_level():
-    profile = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1.0])
-    assert runs_above(profile, 0.5).tolist() == [[1.5, 4.5], [6.5, 8]]
-    assert len(runs_above(profile, 2)) == 0
-
-
-def test_whittaker_keeps_lines_and_fills_gaps():
-    x = np.arange(200) * 0.01
-    weights = np.ones(200)
-    weights[60:120] = 0
-    noisy = np.where(weights > 0, x, 99.0)
-    assert np.allclose(whittaker(noisy, weights, cutoff=50), x, atol=1e-6)
-
-
-def test_whittaker_halves_its_cutoff():
-    t = np.arange(4000)
-    for wavelength, low, high in ((100, 0.45, 0.55), (400, 0.97, 1.0), (25, 0.0, 0.01)):
-        smooth = whittaker(np.sin(2 * np.pi * t / wavelength), np.ones(4000), cutoff=100)
-        assert low <= np.abs(smooth[1000:3000]).max() <= high
-
-
-def test_whittaker_fades_across_gaps_with_a_ridge():
-    weights = np.ones(400)
-    weights[150:250] = 0
-    values = np.where(weights > 0, 1.0, 99.0)
-    smooth = whittaker(values, weights, cutoff=20, ridge=0.02)
-    assert abs(smooth[200]) < 0.2
-    assert smooth[50] == pytest.approx(1, abs=0.03)

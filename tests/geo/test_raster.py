@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
@@ -21,7 +20,6 @@ from vinemap.geo.raster import (
     squares,
     window,
 )
-from vinemap.product.rasters import write_cog
 
 UTM = CRS.from_epsg(32632)
 
@@ -176,26 +174,3 @@ def test_bilinear_sampling_is_exact_on_a_plane():
     raster = Raster(2 * x - 3 * y + 1, grid, UTM)
     xy = np.random.default_rng(1).uniform([101, 32], [129, 49], (200, 2))
     assert np.allclose(sample(raster, xy), 2 * xy[:, 0] - 3 * xy[:, 1] + 1)
-
-
-def test_cog_keeps_values_nodata_units_and_place(tmp_path):
-    values = np.arange(300 * 700, dtype=float).reshape(300, 700)
-    values[5, 7] = np.nan
-    write_cog(
-        Raster(values, Grid(414000.0, 4940000.0, 0.25, 300, 700), UTM),
-        tmp_path / "x.tif",
-        description="terrain",
-        unit="m",
-    )
-    with rasterio.open(tmp_path / "x.tif") as src:
-        assert src.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-        assert src.crs.to_epsg() == 32632
-        assert src.units == ("m",)
-        assert src.descriptions == ("terrain",)
-        assert src.overviews(1)
-        read = src.read(1, masked=True)
-        assert read.mask.sum() == 1
-        assert read.mask[5, 7]
-        assert src.transform.c == 414000.0
-        assert src.transform.f == 4940000.0
-        assert np.array_equal(read.compressed(), values[np.isfinite(values)].astype(np.float32))

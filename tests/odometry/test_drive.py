@@ -16,8 +16,8 @@ from drives import images, poses
 from pyproj import Geod
 
 from vinemap.config.camera import Camera
+from vinemap.config.drives import Start
 from vinemap.errors import InputError, OutputError
-from vinemap.geo.crs import Start
 from vinemap.odometry.drive import map_drive
 from vinemap.odometry.layers import TRACK_LAYERS
 from vinemap.odometry.poses import moved

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from drives import images, poses
 
-from vinemap.geo.crs import Start
+from vinemap.config.drives import Start
 from vinemap.odometry.drive import map_drive
 from vinemap.parcel import map_parcel
 from vinemap.simulate.camera import LOW

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from vinemap.geo.raster import Grid, Raster, RowField
+from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.key_points import central_points, detect_key_points
+from vinemap.rows.waves import RowField
 
 UTM = CRS.from_epsg(32632)
 

@@ -1,7 +1,6 @@
-"""Sections of canopy: convex hull, outlier peeling (Algorithm 1) and the minimum-area c-gon (Problem 1).
+"""The c-gon of least area around a section's hull (Problem 1), three of its vertices given.
 
 A section's points are (y, z) in metres, z up and y drawn to the right; polygons run counter-clockwise.
-Compiled code takes them as complex numbers y + iz; it stays in one file, as compiled functions must.
 """
 
 from __future__ import annotations
@@ -11,27 +10,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.hull import (
-    FLAT,
-    area_of,
-    as_complex,
-    as_pairs,
-    checked_start,
-    cross,
-    order_of,
-    ring_of,
-    shared_area,
-)
+from vinemap.canopy.hull import area_of, as_complex, as_pairs, checked_start, cross, order_of, ring_of, shared_area
 from vinemap.canopy.peeling import peel_section
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from vinemap.compute.arrays import Flags, Floats, Ints
-
-    Points = NDArray[np.complex128]
+    from vinemap.compute.arrays import Complex, Flags, Floats, Ints
 
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""
@@ -108,7 +95,7 @@ def enclose(
 
 
 @compiled
-def _place(ring: Points, foot: complex, side: float, extent: float) -> tuple[int, float, complex]:
+def _place(ring: Complex, foot: complex, side: float, extent: float) -> tuple[int, float, complex]:
     """Edge of the ring that holds a foot, where on it (0-1), and the foot, moved out sideways if it is inside.
 
     Side is 1 for the right foot, which starts the outline and so an edge, and -1 for the left one, which ends one.
@@ -133,7 +120,7 @@ def _place(ring: Points, foot: complex, side: float, extent: float) -> tuple[int
 
 
 @compiled
-def _outline(rest: Points, right: complex, left: complex) -> Points:
+def _outline(rest: Complex, right: complex, left: complex) -> Complex:
     """Vertices (n + 1,) of the hull of a convex polygon and both feet, from the right foot round to the left one."""
     corners = np.empty(len(rest) + 2, dtype=np.complex128)
     corners[0], corners[1] = right, left
@@ -163,7 +150,7 @@ def _outline(rest: Points, right: complex, left: complex) -> Points:
 
 
 @compiled
-def _turn(q: Points, i: int, j: int) -> float:
+def _turn(q: Complex, i: int, j: int) -> float:
     """Sine of the turn from edge i of the outline to edge j, times their lengths; 0 where it is 0 or 180°."""
     a, b = q[i + 1] - q[i], q[j + 1] - q[j]
     sine = a.real * b.imag - a.imag * b.real
@@ -171,7 +158,7 @@ def _turn(q: Points, i: int, j: int) -> float:
 
 
 @compiled
-def _corner(q: Points, i: int, j: int) -> tuple[complex, float]:
+def _corner(q: Complex, i: int, j: int) -> tuple[complex, float]:
     """Where edges i < j of the outline meet, and twice the area of (q[i + 1], corner, q[j]); infinite if they don't."""
     turn = _turn(q, i, j)
     if j == i + 1 or turn <= 0:
@@ -181,7 +168,7 @@ def _corner(q: Points, i: int, j: int) -> tuple[complex, float]:
 
 
 @compiled
-def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
+def _tangent(q: Complex, i: int, j: int) -> tuple[complex, complex, float]:
     """Ends of the edge between edges i < j that touches the outline at its midpoint, where that can beat flush edges.
 
     That is where i and j turn by more than 180°. The area is twice that of (q[i + 1], end, end, q[j]), else infinite.
@@ -203,7 +190,7 @@ def _tangent(q: Points, i: int, j: int) -> tuple[complex, complex, float]:
 
 
 @compiled
-def _choose(q: Points, c: int) -> Points:
+def _choose(q: Complex, c: int) -> Complex:
     """The c - 3 free vertices: c - 2 of the outline's edges, first and last included, that add the least area to it.
 
     All are flush but at most one; no vertices where no choice closes the polygon. State of the dynamic programme:
@@ -231,7 +218,7 @@ def _choose(q: Points, c: int) -> Points:
 
 
 @compiled
-def _trace(q: Points, origin: Ints, spent: int) -> Points:
+def _trace(q: Complex, origin: Ints, spent: int) -> Complex:
     """The vertices of a choice, from its last edge back."""
     used, j = origin.shape[1] - 1, origin.shape[2] - 1
     free = np.empty(used, dtype=np.complex128)
@@ -249,7 +236,7 @@ def _trace(q: Points, origin: Ints, spent: int) -> Points:
 
 
 @compiled
-def _simplify(q: Points) -> Points:
+def _simplify(q: Complex) -> Complex:
     """A circumscribed outline of fewer edges (see LONGEST), first and last edge kept."""
     n, size, last = len(q) - 1, 1, 0
     out = np.empty_like(q)
@@ -265,7 +252,7 @@ def _simplify(q: Points) -> Points:
 
 
 @compiled
-def _split(q: Points, c: int) -> Points:
+def _split(q: Complex, c: int) -> Complex:
     """The inner vertices of an outline of c - 2 edges or fewer, its longest edges halved until there are c - 3."""
     out = np.empty(c - 1, dtype=np.complex128)
     for k in range(len(q)):
@@ -282,7 +269,7 @@ def _split(q: Points, c: int) -> Points:
 
 
 @compiled
-def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: Points) -> None:
+def _polygon(rest: Complex, bottom: complex, right: complex, left: complex, out: Complex) -> None:
     """Write the c-gon around a convex polygon to ``out`` (c,)."""
     if right.real < left.real:
         right, left = left, right
@@ -304,7 +291,7 @@ def _polygon(rest: Points, bottom: complex, right: complex, left: complex, out: 
 
 
 @compiled
-def _slide(rest: Points, bottom: complex, out: Points) -> bool:
+def _slide(rest: Complex, bottom: complex, out: Complex) -> bool:
     """Write the c-gon whose v2 and vc lie on the line of the edge of ``rest`` that holds v1; whether one does."""
     c, extent = len(out), 0.0
     for corner in rest:
@@ -327,12 +314,12 @@ def _slide(rest: Points, bottom: complex, out: Points) -> bool:
 def _enclose_all(
     first: int,
     last: int,
-    points: Points,
+    points: Complex,
     start: Ints,
-    feet: Points,
+    feet: Complex,
     share: float,
     slide: bool,
-    polygon: Points,
+    polygon: Complex,
     kept: Flags,
     areas: Floats,
 ) -> None:
@@ -344,3 +331,7 @@ def _enclose_all(
             if not (slide and _slide(ring, feet[k, 0], polygon[k])):
                 _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], polygon[k])
             areas[0, k], areas[1, k], areas[2, k] = area_of(ring), area_of(polygon[k]), shared_area(polygon[k], ring)
+
+
+FLAT = 1e-12
+"""Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""

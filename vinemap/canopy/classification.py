@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.cloud.points import PointCloud
 
-
 OTHER, GROUND, CANOPY, NOISE = 1, 2, 5, 7
 COMPANIONS = 3
 """Points that lie near a point in the air, or it is noise."""

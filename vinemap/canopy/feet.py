@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.compute.arrays import Ints, Values
 
-
 FOOT_BIN = 0.025
 """Metres: bins of the histograms that tell the foliage's foot."""
 FOOT_RANKS = 0.02, 0.1

@@ -1,4 +1,4 @@
-"""Canopy told from terrain in every section, and measured (thesis, section 3.2.2)."""
+"""Canopy told from terrain and noise in every section (thesis, section 3.2.2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from vinemap.canopy.points import Sections
     from vinemap.compute.arrays import Flags, Ints, Values
-
 
 BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""

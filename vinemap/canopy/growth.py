@@ -1,4 +1,4 @@
-"""What foliage reaches beyond the hull of so few points: how far, and the outline that is grown by it."""
+"""What foliage reaches beyond the hull of its points, the farther the fewer they are, and the outline grown by it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from vinemap.canopy.points import Sections
-    from vinemap.compute.arrays import Floats, Ints, Values
-
-    Points = NDArray[np.complex128]
-
+    from vinemap.compute.arrays import Complex, Floats, Ints, Values
 
 BLUNT = 0.5
 """Cosine of the turn up to which a corner of a grown outline stays one; sharper ones are cut."""
@@ -33,7 +30,7 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
     Parameters
     ----------
     points, start : array_like of shape (n, 2), (m + 1,)
-        As in :func:`peel_sections`.
+        As in :func:`vinemap.canopy.peeling.peel_sections`.
     feet : array_like of shape (m, 3, 2)
         v1 (bottom, middle), v2 (right foot, positive y) and vc (left foot), m.
     reach : array_like of shape (m,)
@@ -61,7 +58,7 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
 
 @compiled
 def _grow_all(
-    first: int, last: int, points: Points, start: Ints, feet: Points, reach: Floats, out: Points, sizes: Ints
+    first: int, last: int, points: Complex, start: Ints, feet: Complex, reach: Floats, out: Complex, sizes: Ints
 ) -> None:
     """Write the outlines' vertices, twice as many as a section's points and feet at the most, and how many they are."""
     for k in range(first, last):

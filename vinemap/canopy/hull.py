@@ -13,14 +13,9 @@ import numpy as np
 from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from vinemap.compute.arrays import Floats, Ints
-
-    Points = NDArray[np.complex128]
-
-FLAT = 1e-12
-"""Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""
+    from vinemap.compute.arrays import Complex, Floats, Ints
 
 
 def checked_start(start: ArrayLike, n: int, share: float) -> Ints:
@@ -43,12 +38,12 @@ def hull(points: ArrayLike) -> Ints:
     return order[ring_of(section[order])] if len(section) else order
 
 
-def as_complex(points: ArrayLike) -> Points:
+def as_complex(points: ArrayLike) -> Complex:
     """Points (..., 2) as complex numbers (...)."""
     return np.ascontiguousarray(points, dtype=np.float64).reshape(*np.shape(points)[:-1], 2).view(np.complex128)[..., 0]
 
 
-def as_pairs(points: Points) -> Floats:
+def as_pairs(points: Complex) -> Floats:
     """Complex numbers (...) as points (..., 2)."""
     return np.ascontiguousarray(points).view(np.float64).reshape(*points.shape, 2)
 
@@ -60,7 +55,7 @@ def cross(a: complex, b: complex, p: complex) -> float:
 
 
 @compiled
-def area_of(polygon: Points) -> float:
+def area_of(polygon: Complex) -> float:
     """Shoelace area, positive if counter-clockwise (Eq. 13 without its absolute values)."""
     total = 0.0
     for i in range(2, len(polygon)):
@@ -69,7 +64,7 @@ def area_of(polygon: Points) -> float:
 
 
 @compiled
-def order_of(p: Points) -> Ints:
+def order_of(p: Complex) -> Ints:
     """Order by y, then z, then index (bottom-up merge sort)."""
     n = len(p)
     order, spare = np.arange(n), np.empty(n, dtype=np.int64)
@@ -95,7 +90,7 @@ def order_of(p: Points) -> Ints:
 
 
 @compiled
-def append_to(p: Points, chain: Ints, floor: int, size: int, i: int) -> int:
+def append_to(p: Complex, chain: Ints, floor: int, size: int, i: int) -> int:
     """Add point i to the convex chain that begins at chain[floor], dropping those that it hides; the new size."""
     while size - floor >= 2 and cross(p[chain[size - 2]], p[chain[size - 1]], p[i]) <= 0:
         size -= 1
@@ -104,7 +99,7 @@ def append_to(p: Points, chain: Ints, floor: int, size: int, i: int) -> int:
 
 
 @compiled
-def ring_of(p: Points) -> Ints:
+def ring_of(p: Complex) -> Ints:
     """Positions on the hull of sorted points (monotone chain)."""
     n = len(p)
     chain = np.empty(n + 2, dtype=np.int64)
@@ -122,7 +117,7 @@ def ring_of(p: Points) -> Ints:
 
 
 @compiled
-def shared_area(polygon: Points, convex: Points) -> float:
+def shared_area(polygon: Complex, convex: Complex) -> float:
     """Area that a polygon shares with a convex one, both counter-clockwise (Sutherland and Hodgman 1974)."""
     inside = polygon.copy()
     for k in range(len(convex)):
@@ -144,7 +139,7 @@ def shared_area(polygon: Points, convex: Points) -> float:
     return area_of(inside)
 
 
-def packed(points: Points, at: Ints, size: Ints) -> tuple[Floats, Ints]:
+def packed(points: Complex, at: Ints, size: Ints) -> tuple[Floats, Ints]:
     """Points (k, 2) that were written with room between them, ``size`` of them from each place on, and their starts."""
     start = np.concatenate([[0], np.cumsum(size)])
     return as_pairs(points[np.arange(start[-1]) + np.repeat(at - start[:-1], size)]), start

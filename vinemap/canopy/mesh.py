@@ -1,4 +1,4 @@
-"""Canopy meshes: sections joined to closed pieces (Eq. 22), their volume, glTF, and Open3D's opinion of them."""
+"""Canopy meshes: sections joined to closed pieces (Eq. 22), their volume, and Open3D's opinion of them."""
 
 from __future__ import annotations
 

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.compute.arrays import Ints, Values
 
-
 HECTARE = 10_000.0
 """Square metres."""
 LOW, HIGH, TOP = 0.02, 0.98, 0.985

@@ -7,25 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.hull import (
-    append_to,
-    area_of,
-    as_complex,
-    checked_start,
-    cross,
-    order_of,
-    packed,
-    ring_of,
-)
+from vinemap.canopy.hull import append_to, area_of, as_complex, checked_start, cross, order_of, packed, ring_of
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from vinemap.compute.arrays import Flags, Floats, Ints
-
-    Points = NDArray[np.complex128]
+    from vinemap.compute.arrays import Complex, Flags, Floats, Ints
 
 
 class Peeled(NamedTuple):
@@ -81,7 +70,7 @@ def peel(points: ArrayLike, count: int) -> Ints:
 
 
 @compiled
-def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
+def _walk(p: Complex, inner: Flags, chain: Ints, size: int, stop: int) -> int:
     """Extend the chain from its last point to ``stop`` over the inner points right of the line between them."""
     floor = size - 1
     first = chain[floor]
@@ -94,7 +83,7 @@ def _walk(p: Points, inner: Flags, chain: Ints, size: int, stop: int) -> int:
 
 
 @compiled
-def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[int, float]:
+def _expose(p: Complex, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[int, float]:
     """Hull from one neighbour of u to the other once u is gone: size of ``chain``, and twice the area lost."""
     a, b = ring[0, u], ring[1, u]
     chain[0] = a
@@ -123,7 +112,7 @@ def _expose(p: Points, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[i
 
 
 @compiled
-def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
+def _peel(p: Complex, index: Ints, count: int) -> tuple[Ints, Ints]:
     """Positions removed from sorted points, in order, and those on the hull that is left; ``index`` breaks ties."""
     n = len(p)
     vertices = ring_of(p)
@@ -163,7 +152,7 @@ def _peel(p: Points, index: Ints, count: int) -> tuple[Ints, Ints]:
 
 
 @compiled
-def peel_section(points: Points, kept: Flags, share: float) -> Points:
+def peel_section(points: Complex, kept: Flags, share: float) -> Complex:
     """The convex hull of a section's kept points, once the outliers among them are no longer kept."""
     here = np.flatnonzero(kept)
     p = points[here]
@@ -179,13 +168,13 @@ def peel_section(points: Points, kept: Flags, share: float) -> Points:
 def _peel_all(
     first: int,
     last: int,
-    points: Points,
+    points: Complex,
     start: Ints,
     share: float,
     kept: Flags,
     area: Floats,
     perimeter: Floats,
-    hulls: Points,
+    hulls: Complex,
     size: Ints,
 ) -> None:
     for k in range(first, last):

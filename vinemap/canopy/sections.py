@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
-
 T = TypeVar("T")
 
 SOIL, SOIL_POINTS = 0.3, 200

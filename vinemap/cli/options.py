@@ -35,7 +35,7 @@ class StartParam(click.ParamType):  # type: ignore[type-arg]
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The start in a text, checked."""
-        from vinemap.geo.crs import Start, check_start
+        from vinemap.config.drives import Start, check_start
 
         try:
             start = Start(*(float(part) for part in str(value).split(",")))

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Grid
 
-
 GUIDE = 0.25
 """Metres between the points of a curve to which cloud points are referred, and the cells of their lookup."""
-
 
 ROWS_AT_ONCE = 4_000_000
 """Points, about, of the rows that are worked together."""

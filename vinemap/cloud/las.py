@@ -1,4 +1,4 @@
-"""Reading LAS, LAZ and COPC files into metres of one projected CRS, and writing LAZ."""
+"""LAS, LAZ and COPC files read in chunks into metres of one projected CRS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point clouds in memory or in tiles on disk, and sections of a cloud."""
+"""Points in memory."""
 
 from __future__ import annotations
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats
     from vinemap.geo.raster import Raster
 
-
 CHUNK = 1_000_000
 """Points that are moved to tiles at once."""
 SIDE = 64.0

@@ -12,3 +12,5 @@ Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 """Grey levels (height, width)."""
+Complex = NDArray[np.complex128]
+"""Points of a plane as y + iz."""

@@ -12,7 +12,6 @@ from vinemap.config.settings import Options
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
 
-
 LENS_TERMS = (0, 4, 5, 8)
 NARROWEST, WIDEST = 2.0, 150.0
 """Degrees across which a camera sees."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
@@ -11,7 +11,31 @@ from vinemap.config.camera import Camera
 from vinemap.config.names import Name
 from vinemap.config.settings import OdometryOptions, Options
 from vinemap.config.yaml_files import checked_by, read_yaml, validated
-from vinemap.geo.crs import Start, check_start
+from vinemap.errors import ConfigError
+from vinemap.geo.crs import Origin, check_origin
+
+
+class Start(NamedTuple):
+    """Where a robot's first frame was taken: WGS84 latitude and longitude, heading clockwise from north, in degrees."""
+
+    lat: float
+    lon: float
+    heading_deg: float
+
+
+def check_start(start: Start) -> Start:
+    """Return a start that lies on the globe.
+
+    Raises
+    ------
+    ConfigError
+        If it doesn't, or its heading is no angle.
+    """
+    check_origin(Origin(start.lat, start.lon, 0.0))
+    if not abs(start.heading_deg) <= 360:
+        raise ConfigError(f"heading {start.heading_deg:g}: give degrees clockwise from north")
+    return start
+
 
 MapStart = Annotated[Start, checked_by(check_start)]
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats
     from vinemap.export.field import Field
 
-
 STEP, FEWEST = 1.0, 5
 """Metres between points, as AgOpenGPS itself records them, and how many it wants of a curve."""
 CURVE = 4

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats
     from vinemap.export.neighbours import Pair, Side
 
-
 TANGENT = 2.0
 """Metres at the end of a lane that give its direction there."""
 FINE = 0.001

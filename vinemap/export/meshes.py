@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vinemap import paths
-from vinemap.canopy.mesh import Mesh
 from vinemap.geo.crs import to_main
 from vinemap.product.gltf import read_glb
 

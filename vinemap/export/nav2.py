@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from vinemap.export.field import Field
 
-
 NEAR = 0.1
 """Metres from a row at which a way counts as one through it."""
 

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Floats, Ints
 
-
 STEP = 0.5
 """Metres between the places of a row from which it looks around."""
 NEIGHBOURS = 1.6

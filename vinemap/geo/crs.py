@@ -19,6 +19,9 @@ from vinemap.errors import ConfigError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.compute.arrays import Floats
+    from vinemap.geo.raster import Raster
+
 WGS84 = CRS.from_epsg(4326)
 ELLIPSOIDAL = "ellipsoidal height"
 """What stands for the vertical datum of a CRS whose third axis is the height above its ellipsoid."""
@@ -48,28 +51,6 @@ def check_origin(origin: Origin) -> Origin:
             "degrees and altitude in metres"
         )
     return origin
-
-
-class Start(NamedTuple):
-    """Where a robot's first frame was taken: WGS84 latitude and longitude, heading clockwise from north, in degrees."""
-
-    lat: float
-    lon: float
-    heading_deg: float
-
-
-def check_start(start: Start) -> Start:
-    """Return a start that lies on the globe.
-
-    Raises
-    ------
-    ConfigError
-        If it doesn't, or its heading is no angle.
-    """
-    check_origin(Origin(start.lat, start.lon, 0.0))
-    if not abs(start.heading_deg) <= 360:
-        raise ConfigError(f"heading {start.heading_deg:g}: give degrees clockwise from north")
-    return start
 
 
 def parse_crs(text: str) -> CRS:
@@ -223,3 +204,27 @@ def main_to_wgs84(xyz: ArrayLike, origin: Origin) -> NDArray[np.float64]:
 def to_main(xyz: ArrayLike, crs: CRS, origin: Origin) -> NDArray[np.float64]:
     """Points (n, 3) of a projected CRS in {Main}."""
     return wgs84_to_main(to_wgs84(xyz, crs), origin)
+
+
+FARTHEST = 50_000.0
+"""Metres from the origin of {Main}, a plane that the globe leaves by then."""
+
+
+def corner_of(dtm: Raster) -> Origin:
+    """Origin of {Main} where none is given: the south-western corner of the terrain, at its lowest elevation."""
+    grid = dtm.grid
+    south = grid.north - grid.ny * grid.resolution
+    lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
+    return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
+
+
+def check_near(origin: Origin, point: Floats, crs: CRS) -> None:
+    """Make sure that an origin of {Main} lies near the cloud, one point (3,) of which is given.
+
+    Raises
+    ------
+    InputError
+        If it doesn't.
+    """
+    if np.abs(to_main(point[None], crs, origin)[0, :2]).max() > FARTHEST:
+        raise InputError(f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first")

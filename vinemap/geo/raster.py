@@ -1,4 +1,4 @@
-"""North-up rasters: cells of points, sampling, and Cloud Optimized GeoTIFF."""
+"""North-up rasters: their grids, cells of points, and sampling."""
 
 from __future__ import annotations
 
@@ -51,15 +51,6 @@ class Raster:
     values: NDArray[np.floating]
     grid: Grid
     crs: CRS
-
-
-@dataclass(frozen=True)
-class RowField:
-    """Rasters of direction (degrees anticlockwise from east, axial in [0, 180)), spacing (m), likelihood (0–1)."""
-
-    direction: Raster
-    spacing: Raster
-    likelihood: Raster
 
 
 def grid_over(low: ArrayLike, high: ArrayLike, *, resolution: float, multiple: int = 1) -> Grid:

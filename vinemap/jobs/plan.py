@@ -13,7 +13,7 @@ from vinemap.config.names import check_name
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import read_parcels
 from vinemap.geo.crs import parse_crs
-from vinemap.parcel import found
+from vinemap.parcel import in_words
 from vinemap.product.recipe import Recipe, Source, flown, product_in, read_source
 from vinemap.product.store import write_whole
 
@@ -46,7 +46,7 @@ class Outcome:
 
     def line(self) -> str:
         """The same as a sentence."""
-        what = f"{found(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
+        what = f"{in_words(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
         colon = "; " if self.state == DONE else ": "
         return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
 

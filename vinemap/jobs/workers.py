@@ -22,7 +22,7 @@ import traceback
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
-from vinemap.compute.machine import use
+from vinemap.compute import machine
 from vinemap.errors import VinemapError, WorkerError, own_fault
 
 if TYPE_CHECKING:
@@ -257,7 +257,7 @@ def serve(cores: int, memory: int) -> NoReturn:
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(2, 1)
-    use(cores=cores, memory=memory)
+    machine.use(cores=cores, memory=memory)
     _limit(memory)
     _die_with_parent()
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Values
     from vinemap.parcel import RowMap
 
-
 BOUNDS = [(0.1, 1.0), (0.1, 2.0), (5, 11)]
 """The thesis's ranges of a and b, in metres, and of c."""
 THESIS = (0.4, 0.25, 7)

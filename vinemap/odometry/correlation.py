@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 COARSE_STEP, CANDIDATES = 3.0, 8
 """The coarse search: degrees between its angles, and peaks that are looked into."""
+
 CLIMBS = 8
 """Times that a peak may lie on the edge of where it is looked for before it is left."""
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.config.camera import Camera
-    from vinemap.geo.crs import Start
+    from vinemap.config.drives import Start
     from vinemap.odometry.frames import Frame
     from vinemap.odometry.refinement import Method
 

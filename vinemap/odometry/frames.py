@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Image
     from vinemap.config.camera import Camera
 
-
 IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mjpg", ".mjpeg", ".mpg", ".mpeg", ".ts", ".wmv"}
 ENDS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND"}

@@ -42,3 +42,28 @@ def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Pl
     x, y = moved[shown], b[shown]
     quadrants = np.mean(np.sign(x - np.median(x)) * np.sign(y - np.median(y)))
     return float(np.sin(np.pi / 2 * quadrants)), overlap
+
+
+def doubt(
+    view: View, next_view: View, at_limits: Sequence[bool], *, score: float, agreement: float, rival: float
+) -> str:
+    """Why a step isn't to be believed, in a word; empty if it is.
+
+    Parameters
+    ----------
+    view, next_view : View
+        The frames.
+    at_limits : sequence of bool
+        Whether its turn, row and column lie where the search ends.
+    score, agreement, rival : float
+        Correlation of the template, of all that both frames show, and of the next best place.
+    """
+    turned, *out = at_limits
+    doubts = {
+        "overlap": any(out),
+        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT,
+        "repeats": rival > MOST_RIVAL * agreement,
+        "step": turned,
+        "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
+    }
+    return next((reason for reason, doubted in doubts.items() if doubted), "")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from vinemap.geo.crs import Start
+    from vinemap.config.drives import Start
     from vinemap.odometry.track import Fix
 
 NOWHERE = CRS.from_wkt(

@@ -1,4 +1,7 @@
-"""Peaks of a correlation, refined between the steps of the search (Eq. 9–12 and better)."""
+"""Peaks of a correlation, refined between the steps of the search.
+
+The thesis's print is put right: the centroid of Eq. 10–12 divides by the sum of the weights, and sums angles.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,6 @@ from vinemap.odometry.correlation import Place, Search, correlation, near, place
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
     from vinemap.odometry.correlation import Index
-
 
 Method = Literal["aligned", "quadratic", "centroid", "maximum"]
 NEIGHBOURS, SHARE_OF_PEAK = 5, 0.95

@@ -1,7 +1,7 @@
 """Visual odometry: how a robot moved between two frames of a camera that looks down, by cross-correlation.
 
 Chapter 4 of the thesis, its print put right: Eq. 8 gives the ground's movement as the robot sees it, of which the
-robot's own is the negative; the centroid of Eq. 10–12 divides by the sum of the weights, and sums angles.
+robot's own is the negative.
 """
 
 from __future__ import annotations
@@ -11,17 +11,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from vinemap.errors import InputError
-from vinemap.odometry.correlation import (
-    COARSE_STEP,
-    Place,
-    Search,
-    climb,
-    coarse_peaks,
-    peak,
-    place_at,
-    search_of,
-)
-from vinemap.odometry.judgement import LEAST_AGREEMENT, LEAST_SCORE, LEAST_SHARPNESS, MOST_RIVAL, agreement_at
+from vinemap.odometry.correlation import COARSE_STEP, Place, Search, climb, coarse_peaks, peak, place_at, search_of
+from vinemap.odometry.judgement import agreement_at, doubt
 from vinemap.odometry.poses import Pose, onward
 from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
@@ -29,7 +20,6 @@ from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Image, Values
     from vinemap.config.camera import Camera
-
 
 Strategy = Literal["coarse to fine", "exhaustive"]
 ANGLES = (-9.0, 9.0)
@@ -170,15 +160,8 @@ def motion_between(
     rival = max((agreed[index] for index in others), default=0.0)
     place = refine(fine, top, method)
     agreement, overlap = agreement_at(view, next_view, centre, place)
-    at_limit, *out = (not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True))
-    doubts = {
-        "overlap": any(out),
-        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT,
-        "repeats": rival > MOST_RIVAL * agreement,
-        "step": at_limit,
-        "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
-    }
-    flag = next((reason for reason, doubted in doubts.items() if doubted), "")
+    at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]
+    flag = doubt(view, next_view, at_limits, score=score, agreement=agreement, rival=rival)
     return _motion(camera, centre, place, score, agreement, rival, overlap, flag)
 
 

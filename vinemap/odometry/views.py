@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from vinemap.config.camera import Camera
     from vinemap.odometry.refinement import Method
 
-
 SMOOTHING, SMOOTHED_SIZE = 1.0, 240
 """Sigma in pixels of the Gaussian that both frames get, as interpolation blurs the turned template, and only that one;
 it grows with frames whose shorter side has more pixels than that, so that all see the ground's relief alike."""
@@ -40,7 +39,13 @@ class View(NamedTuple):
 
 
 def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View:
-    """Make a frame ready for :func:`motion_between`; InputError as of :func:`estimate_motion`."""
+    """Make a frame ready for :func:`vinemap.odometry.step.motion_between`.
+
+    Raises
+    ------
+    InputError
+        If it isn't grey, of 8 bits and of the camera's size.
+    """
     import cv2
 
     if image.ndim != 2 or image.dtype != np.uint8:

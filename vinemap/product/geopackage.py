@@ -1,4 +1,4 @@
-"""Vector layers: what a product's GeoPackage holds, reading boundaries, and writing it with its styles."""
+"""Layers written as a GeoPackage, with the styles that QGIS applies by itself."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
-
 
 EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 SMALLEST = 1 << 20

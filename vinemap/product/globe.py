@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats
     from vinemap.geo.geoid import Geoid
 
-
 GEODETIC, GEOCENTRIC = CRS.from_epsg(4979), CRS.from_epsg(4978)
 STEP = 10.0
 """Metres to both sides of a point over which derivatives are taken."""

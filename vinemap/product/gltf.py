@@ -1,4 +1,4 @@
-"""Canopies read back from glTF, and written as PLY and OBJ."""
+"""Canopies as binary glTF: written, and read back."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.compute.arrays import Floats, Ints
-
 
 STRIP = 5
 """glTF's mode of triangle strips."""

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
     from vinemap.product.recipe import Recipe
 
-
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
 
 
-def run_record(
+def record_of(
     recipe: Recipe,
     points: Cloud,
     layers: dict[str, gpd.GeoDataFrame],

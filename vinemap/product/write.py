@@ -1,4 +1,4 @@
-"""What a parcel's run leaves: layers, rasters, meshes, and what is known of its inputs."""
+"""The files that a run leaves, but its record and its pages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from vinemap.canopy.mesh import Mesh
     from vinemap.cloud.tiles import Cloud
-    from vinemap.geo.raster import Raster, RowField
+    from vinemap.geo.raster import Raster
+    from vinemap.rows.waves import RowField
 
 
 def write_product(

@@ -1,4 +1,4 @@
-"""The centre line of a row's canopy in a straightened image of it, and the smoothing that makes it one."""
+"""The middle of a row in a straightened image of it: its centre line, and the smoothing that makes it one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
-
 
 TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""

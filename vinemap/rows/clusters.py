@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Ints, Values
 
-
 TANGENT_LENGTH = 5.0
 """Metres of a piece's end that tell its tangent."""
 BEND_LENGTH = 10.0

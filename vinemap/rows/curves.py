@@ -24,7 +24,6 @@ from vinemap.rows.centre_line import centre_line, half_width, runs_above, whitta
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
 
-
 STATION = 0.1
 """Metres between the stations of a straightened row."""
 BIN = 0.05

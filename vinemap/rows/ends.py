@@ -13,14 +13,13 @@ from vinemap.rows.centre_line import CELL, runs_above
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
 
-
 AROUND = 0.3
 """Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
 
 
-class Fit(NamedTuple):
+class Standing(NamedTuple):
     """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast."""
 
     curve: Values
@@ -28,7 +27,7 @@ class Fit(NamedTuple):
     contrast: float
 
 
-def find_ends(curve: Values, image: Values, end_share: float) -> Fit | None:
+def cut_to_canopy(curve: Values, image: Values, end_share: float) -> Standing | None:
     """Cut a curve to where its canopy begins and ends; None where there is none."""
     profile = image.sum(axis=1) * CELL
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
@@ -52,4 +51,4 @@ def find_ends(curve: Values, image: Values, end_share: float) -> Fit | None:
     aside = max(1, canopy.shape[1] // 8)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
-    return Fit(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
+    return Standing(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)

@@ -15,14 +15,13 @@ from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.spatial import cKDTree
 
 from vinemap.geo.curve import at
-from vinemap.geo.raster import Grid, Raster, RowField, coarser
-from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, scan_cylinders, scan_spectrum
+from vinemap.geo.raster import Grid, Raster, coarser
+from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, scan_cylinders, scan_spectrum
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.compute.arrays import Ints, Values
-
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""

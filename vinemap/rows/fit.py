@@ -23,7 +23,7 @@ from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, normals, resample, way_along
 from vinemap.geo.raster import Raster, nearest_cell, sample
 from vinemap.rows.centre_line import CELL, centre_line, half_width
-from vinemap.rows.ends import Fit, find_ends
+from vinemap.rows.ends import Standing, cut_to_canopy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Grid
-
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
@@ -75,7 +74,7 @@ def fit_rows(
     end_share: float = 0.6,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
-    """Fit the rows' curves to the points of their canopies.
+    """Standing the rows' curves to the points of their canopies.
 
     Parameters
     ----------
@@ -106,7 +105,7 @@ def fit_rows(
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
-    fits: dict[int, Fit | None] = {}
+    fits: dict[int, Standing | None] = {}
     for group, shares in _deal(cloud, cover, curves, half, low, high):
         found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
         fits |= dict(zip(group.tolist(), found, strict=True))
@@ -128,14 +127,14 @@ def fit_rows(
     )
 
 
-def _fit(share: _Share, *, smoothing: float, end_share: float) -> Fit | None:
+def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
     """Centre line of a row about its course, between the ends of its canopy."""
     still = np.zeros(len(share.curve))
     image, offsets = _straighten(share, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
     shift = centre_line(image, offsets, reach=0.75 * share.half, cutoff=cutoff)
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
-    return find_ends(centred, _straighten(share, shift)[0], end_share)
+    return cut_to_canopy(centred, _straighten(share, shift)[0], end_share)
 
 
 def _smooth_course(course: Values) -> Values:

@@ -13,8 +13,8 @@ from vinemap.geo.raster import cell_of, sample, sample_across
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
-    from vinemap.geo.raster import Grid, Raster, RowField
-
+    from vinemap.geo.raster import Grid, Raster
+    from vinemap.rows.waves import RowField
 
 BATCH = 5_000
 SLICES = 3

@@ -9,18 +9,10 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.errors import InputError
 from vinemap.geo.crs import WGS84, Origin, to_main, to_wgs84
 
 if TYPE_CHECKING:
-    from pyproj import CRS
-
     from vinemap.compute.arrays import Floats, Ints
-    from vinemap.geo.raster import Raster
-
-
-FARTHEST = 50_000.0
-"""Metres from the origin of {Main}, a plane that the globe leaves by then."""
 
 
 def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -177,23 +169,3 @@ def _orientation(xyz: Floats) -> float:
 def _mean_elevation(xyz: Floats) -> float:
     step = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
     return float(np.average((xyz[1:, 2] + xyz[:-1, 2]) / 2, weights=step))
-
-
-def corner_of(dtm: Raster) -> Origin:
-    """Origin of {Main} where none is given: the south-western corner of the terrain, at its lowest elevation."""
-    grid = dtm.grid
-    south = grid.north - grid.ny * grid.resolution
-    lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
-    return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
-
-
-def check_near(origin: Origin, point: Floats, crs: CRS) -> None:
-    """Make sure that an origin of {Main} lies near the cloud, one point (3,) of which is given.
-
-    Raises
-    ------
-    InputError
-        If it doesn't.
-    """
-    if np.abs(to_main(point[None], crs, origin)[0, :2]).max() > FARTHEST:
-        raise InputError(f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first")

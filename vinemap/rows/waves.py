@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.compute.arrays import Ints, Values
-
+    from vinemap.geo.raster import Raster
 
 CYLINDER_TURN = 1.0
 """Degrees between the directions in which a cylinder is sliced."""
@@ -193,3 +194,12 @@ def _vertex(left: float, middle: float, right: float) -> float:
     """Offset in (-0.5, 0.5) of the vertex of the parabola through three neighbours."""
     bend = left - 2 * middle + right
     return float(min(max(0.5 * (left - right) / bend, -0.5), 0.5)) if abs(bend) > 1e-9 else 0.0
+
+
+@dataclass(frozen=True)
+class RowField:
+    """Rasters of direction (degrees anticlockwise from east, axial in [0, 180)), spacing (m), likelihood (0–1)."""
+
+    direction: Raster
+    spacing: Raster
+    likelihood: Raster

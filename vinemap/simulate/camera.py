@@ -15,7 +15,6 @@ from vinemap.odometry.poses import Pose
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Image, Values
 
-
 LOW = Camera(width=320, height=240, fx=299.4303, fy=299.4122, above_ground_mm=245.0, x_mm=950.0)
 HIGH = Camera(width=1280, height=720, fx=888.8749, fy=888.5340, above_ground_mm=245.0, x_mm=950.0)
 """The two cameras of Table 4.1, the size as width × height."""

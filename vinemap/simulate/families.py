@@ -19,7 +19,7 @@ from vinemap.simulate.terrain import PLACE, hillside, terraced
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from vinemap.simulate.plants import Array, Terrain
+    from vinemap.simulate.terrain import Array, Terrain
 
 LONG_GAPS = {"gaps": (8, 8, 8, 8, 8, 17), "vine_spacing": 0.9}
 BEFORE_FLOWERING = {"height": 1.3, "half_width": 0.15, "leafiness": 4.0}

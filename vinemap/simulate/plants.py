@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-if TYPE_CHECKING:
-    import shapely
+from vinemap.simulate.terrain import Array, Terrain, waves
 
-Array = NDArray[np.float64]
-Terrain = Callable[[Array, Array], Array]
-"""Elevation (m) of the ground at x (east) and y (north)."""
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import shapely
+    from numpy.typing import NDArray
+
 STATION = 0.1  # spacing of canopy stations along a row (m)
 BARE = 40  # cells without foliage beyond each end of a row, more than a ray crosses
 LAYERS = 16  # heights at which the foliage of a station has a density of its own
@@ -77,21 +77,6 @@ class Stations(NamedTuple):
     half_width: Array  # -1 where bare
     shift: Array  # of the foliage's middle, to the left
     leaves: Array  # (n, LAYERS) per metre
-
-
-def waves(rng: np.random.Generator, wavelength: float) -> Terrain:
-    """Smooth random surface of mean 0 and variance 1, with waves of about ``wavelength`` (m)."""
-    n = 8
-    wave = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.6, n))
-    heading, phase = rng.uniform(0, 2 * np.pi, (2, n))
-
-    def surface(x: Array, y: Array) -> Array:
-        total = np.zeros(np.shape(x))
-        for k in range(n):
-            total += np.sin(wave[k] * (x * math.cos(heading[k]) + y * math.sin(heading[k])) + phase[k])
-        return total * math.sqrt(2 / n)
-
-    return surface
 
 
 def dead_vines_of(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[np.bool_]]:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.simulate.plants import EDGE, LAYERS, Array, Stations, Terrain, bulge
+from vinemap.simulate.plants import EDGE, LAYERS, Stations, bulge
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from vinemap.simulate.terrain import Array, Terrain
 
 STEPS = 14  # steps of a ray through a canopy
 TAN_WIDEST = math.tan(math.radians(35))

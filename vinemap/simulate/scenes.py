@@ -1,4 +1,4 @@
-"""Scenes to simulate: shapes of rows and ground, the example survey, and the families on which accuracy is measured."""
+"""Scenes to simulate: shapes of rows, and the example survey."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vinemap.simulate.terrain import PLACE, hillside, surface_through
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vinemap.simulate.plants import Array
+    from vinemap.simulate.terrain import Array
 
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6

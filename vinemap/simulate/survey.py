@@ -18,17 +18,9 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap import paths
-from vinemap.simulate.plants import (
-    Array,
-    Foliage,
-    Terrain,
-    Vineyard,
-    dead_vines_of,
-    foliage_of,
-    grow,
-    waves,
-)
+from vinemap.simulate.plants import Foliage, Vineyard, dead_vines_of, foliage_of, grow
 from vinemap.simulate.rays import TAN_WIDEST, Obstacle, meet_leaves, meet_obstacle
+from vinemap.simulate.terrain import Array, Terrain, waves
 from vinemap.simulate.truth import truth_of
 
 if TYPE_CHECKING:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.spatial import cKDTree
 
-from vinemap.simulate.plants import waves
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vinemap.simulate.plants import Array, Terrain
-
 PLACE = (414750.0, 4940780.0)
 """Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
+Array = NDArray[np.float64]
+Terrain = Callable[[Array, Array], Array]
+"""Elevation (m) of the ground at x (east) and y (north)."""
 
 
 def hillside(
@@ -96,5 +97,20 @@ def surface_through(
     def surface(x: Array, y: Array) -> Array:
         at = np.stack([(x - origin[0]) / cell, (y - origin[1]) / cell])
         return np.asarray(map_coordinates(spline, at, order=3, mode="nearest", prefilter=False))
+
+    return surface
+
+
+def waves(rng: np.random.Generator, wavelength: float) -> Terrain:
+    """Smooth random surface of mean 0 and variance 1, with waves of about ``wavelength`` (m)."""
+    n = 8
+    wave = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.6, n))
+    heading, phase = rng.uniform(0, 2 * np.pi, (2, n))
+
+    def surface(x: Array, y: Array) -> Array:
+        total = np.zeros(np.shape(x))
+        for k in range(n):
+            total += np.sin(wave[k] * (x * math.cos(heading[k]) + y * math.sin(heading[k])) + phase[k])
+        return total * math.sqrt(2 / n)
 
     return surface

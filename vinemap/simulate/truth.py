@@ -10,12 +10,14 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.simulate.plants import Stations, Terrain, Vineyard, on_ground, reached
+from vinemap.simulate.plants import Stations, Vineyard, on_ground, reached
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    from vinemap.simulate.terrain import Terrain
 
 
 def truth_of(

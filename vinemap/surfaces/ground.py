@@ -1,4 +1,4 @@
-"""Terrain from the cloud: a DTM on a raster of robust low percentiles, and heights above it.
+"""Terrain from the cloud: a DTM on a raster of robust low percentiles.
 
 A cell tells its terrain by a low order statistic of the heights in it, corrected for the statistic's expected
 depth below the mean of the noise. Local planes are fitted to the cells, from coarse to fine; cells that stand
@@ -22,7 +22,6 @@ from vinemap.surfaces.statistics import cells_a_block, order_statistics
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Floats
-
 
 GROUND = 2
 """ASPRS class of ground."""

@@ -13,7 +13,6 @@ from vinemap.geo.raster import block_sum
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Floats
 
-
 NARROWEST = 1.2
 """Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
 RIDGE = 0.02

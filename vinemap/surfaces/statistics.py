@@ -1,4 +1,4 @@
-"""Order statistics of a cloud's heights in cells, part by part of the cloud."""
+"""Order statistics of a cloud's heights in cells and blocks of cells, part by part of the cloud."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from vinemap.geo.raster import Grid, Raster, above, window
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Floats
-
 
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from vinemap.simulate.plants import Foliage
     from vinemap.simulate.survey import Survey
 
-
 SLAB = 0.4
 """Metres along a row over which the true foliage is averaged."""
 NEAR = 0.15

@@ -40,7 +40,6 @@ class Measure(NamedTuple):
 
 Columns = dict[str, dict[str, Measure]]
 
-
 COLUMNS: Columns = {
     "rows": {
         "true": Measure(lambda e: e.rows, np.inf, 0),
@@ -83,7 +82,6 @@ COLUMNS: Columns = {
     },
 }
 """Numbers of the table of rows, by heading and name."""
-
 
 CANOPY_COLUMNS: Columns = {
     TRUE_FOLIAGE: {

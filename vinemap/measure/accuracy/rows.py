@@ -9,7 +9,7 @@ import pandas as pd
 import shapely
 
 from vinemap.evaluate.rows import evaluate_rows
-from vinemap.geo.raster import Raster, RowField, cell_of, sample
+from vinemap.geo.raster import Raster, cell_of, sample
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Floats
     from vinemap.parcel import RowMap
+    from vinemap.rows.waves import RowField
     from vinemap.simulate.survey import Survey
-
 
 NEAR = 0.8
 """Metres within which a gap and a dead vine belong together."""

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
     from vinemap.parcel import RowMap
 
-
 T = TypeVar("T")
 CANOPY = (0.5, 2.9)
 """Heights (m) above ground between which a point is one of canopy."""

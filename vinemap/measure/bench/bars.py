@@ -17,8 +17,6 @@ SMALL = 3e6
 HECTARE = 10_000.0
 START_UP = 2.0
 """Seconds."""
-GROWTH = 1.15
-"""Of the seconds a point, from ``BASE`` to the largest survey."""
 BASE = 2e6
 
 

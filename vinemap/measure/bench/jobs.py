@@ -18,7 +18,6 @@ from vinemap.measure.bench.surveys import estate, survey
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-
 MEMORY = 0.75
 """Share of the machine's memory that a job may address."""
 INSTEAD = ground, rows, polygons
@@ -54,7 +53,6 @@ def peaks(cloud: str, boundary: str, out: str) -> dict[str, int | None]:
 
 
 OURS = survey, estate, reading, peaks
-
 
 JOBS: Mapping[str, Callable[..., dict[str, Any]]] = {job.__name__: job for job in OURS + INSTEAD}
 

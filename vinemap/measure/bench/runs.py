@@ -12,13 +12,7 @@ import click
 
 from vinemap import paths
 from vinemap.compute.processes import must, run_process, summed_memory
-from vinemap.measure.bench.bars import (
-    Bar,
-    Run,
-    of_bar,
-    span,
-    with_other,
-)
+from vinemap.measure.bench.bars import Bar, Run, of_bar, span, with_other
 
 if TYPE_CHECKING:
     from vinemap.measure.bench.tables import Lines

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import shapely
 
     from vinemap.compute.arrays import Floats
-    from vinemap.simulate.plants import Terrain, Vineyard
-
+    from vinemap.simulate.plants import Vineyard
+    from vinemap.simulate.terrain import Terrain
 
 DENSITY = 500.0
 """Rays a square metre of the parcel; a tenth of them finds neither leaf nor ground."""

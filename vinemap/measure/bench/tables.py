@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinemap import __version__
-from vinemap.measure.bench.bars import ALL, GROWTH, HECTARE, Bar, Run, bars, growth_exponent, growth_ratio, of_bar
+from vinemap.measure.bench.bars import ALL, HECTARE, Bar, Run, bars, growth_exponent, growth_ratio, of_bar
 from vinemap.measure.tables import as_markdown, fill
 
 if TYPE_CHECKING:
@@ -80,3 +80,7 @@ def write_tables(tables: Mapping[str, Lines], path: Path) -> None:
     for name, lines in tables.items():
         text = fill(text, name, as_markdown(lines))
     path.write_text(text, encoding="utf-8")
+
+
+GROWTH = 1.15
+"""Of the seconds a point, from ``BASE`` to the largest survey."""
