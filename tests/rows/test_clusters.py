@@ -126,6 +126,25 @@ def test_rows_do_not_reach_over_their_headland():
     assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 5)
 
 
+def test_rows_stay_in_their_block_beside_one_of_another_direction():
+    """Across a track of 5 m another block's rows, 15° off and unevenly long: whichever ends meet, none is carried over."""
+    rng = np.random.default_rng(2)
+    west = [np.array([[rng.uniform(0, 1), 1.8 * k], [30 - rng.uniform(0, 1), 1.8 * k]]) for k in range(14)]
+    turn = np.radians(15)
+    along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    east = [[37, -6] + 1.8 * k * across + rng.uniform(0, 1) * along for k in range(16)]
+    east = [np.array([start, start + 14 * along]) for start in east]
+    assert_rows_are_kept_apart(cluster_rows(key_points([*west, *east])), 30)
+
+
+def test_gaps_of_some_neighbours_that_line_up_are_no_track():
+    """Six rows of fourteen lack the same 7 m, the others go on."""
+    rows = [np.array([[0, 2.4 * k], [40, 2.4 * k]]) for k in range(14)]
+    points = key_points(rows)
+    gap = points["truth"].between(4, 9) & points.geometry.x.between(15, 22)
+    assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 14)
+
+
 def test_straight_rows_are_not_joined_by_a_bend():
     """Two rows of blocks of their own directions, in line with each other's ends; rows on an arc of the same turn."""
     turn = np.radians(24)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
@@ -32,7 +33,15 @@ KINK = 0.2
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 FLANK = 4.0
-"""Metres before and after a gap where neighbouring rows must stand for the gap to be a track."""
+"""Metres before and after a gap in which the rows stand that must end there for it to be a track."""
+ACROSS = 6
+"""Rows on each side of a gap that are looked at for a track."""
+OPEN = 0.62
+"""Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
+STRIDE = 0.5
+"""Metres between the places at which ground is looked at."""
+MARGIN = 0.5
+"""Spacings by which a row must be crossed."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -63,7 +72,7 @@ def cluster_rows(
     max_gap : float
         Metres of missing vines that a row may bridge; 0 joins nothing.
     track_width : float
-        Metres from which a gap that the neighbouring rows share is a track or a headland, where rows end.
+        Metres from which a gap that all rows beside it share is a track or a headland, where rows end.
 
     Returns
     -------
@@ -275,11 +284,11 @@ def _kinked(ends: _Ends, a: Ints, b: Ints, length: Values) -> Flags:
 
 
 def _over_track_or_headland(ends: _Ends, pairs: Ints, xy: Values, track_width: float) -> Flags:
-    """Whether the gap between two ends (k, 2) goes on through the neighbouring rows, three on each side.
+    """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
-    It is a track if most of them stand before it and after it, and three in four of those are empty beside it. It is
-    a headland, beyond which stands something else, if at least two stand on one side of it, three in four of those
-    are empty beside it, and as many don't stand on its other side.
+    What lies farther than half a track from all key points is open ground. The gap lies on a track if the open ground
+    about its middle goes on across all the rows that stand beside its ends, up to ``ACROSS`` on each side: missing
+    vines of some neighbours may line up, those of all don't.
     """
     tree = cKDTree(xy)
     out = np.zeros(len(pairs), dtype=bool)
@@ -289,23 +298,36 @@ def _over_track_or_headland(ends: _Ends, pairs: Ints, xy: Values, track_width: f
         if length < track_width:
             continue
         spacing = float(ends.spacing[[a, b]].mean())
-        middle = (ends.xy[a] + ends.xy[b]) / 2
-        near = xy[tree.query_ball_point(middle, length / 2 + FLANK + 4 * spacing)] - ends.xy[a]
-        x = near @ gap / length
-        rank = np.rint((gap[0] * near[:, 1] - gap[1] * near[:, 0]) / length / spacing)
-        beside = [x[rank == r] for r in (-3, -2, -1, 1, 2, 3)]
-        stands = np.array([[_covered(r, -FLANK, 0), _covered(r, length, length + FLANK)] for r in beside]) > 0.5
-        empty = np.array([_covered(r, 0.5, length - 0.5) < 0.3 for r in beside])
-        there = stands.any(axis=1) | ~empty
-        through = stands.all(axis=1)
-        out[k] = through.sum() > 0.5 * there.sum() and empty[through].mean() >= 0.75
-        for here, beyond in (stands.T, stands.T[::-1]):
-            out[k] |= here.sum() > 1 and empty[here].mean() >= 0.75 and beyond[here].mean() <= 0.25
+        middle, along = (ends.xy[a] + ends.xy[b]) / 2, gap / length
+        around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
+        near = xy[tree.query_ball_point(middle, around)] - middle
+        x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
+        beside = (np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)
+        standing = np.unique(np.rint(y[beside]).astype(int))
+        open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
+        sides = [side[(side >= 1) & (side <= ACROSS)] for side in (standing, -standing)]
+        out[k] = sum(map(len, sides)) > 1 and all((s <= far).all() for s, far in zip(sides, open_to, strict=True))
     return out
 
 
-def _covered(x: Values, low: float, high: float) -> float:
-    """Share of the half metres between two bounds that hold a point."""
-    n = max(1, round((high - low) / 0.5))
-    cell = np.floor((x - low) / (high - low) * n)
-    return len(np.unique(cell[(cell >= 0) & (cell < n)])) / n
+def _open_across(
+    tree: cKDTree, middle: Values, along: Values, length: float, spacing: float, radius: float
+) -> tuple[float, float]:
+    """Rows to the left and to the right up to which the open ground about the middle of a gap goes on."""
+    cells = int(np.ceil((ACROSS + 1) * spacing / STRIDE))
+    across = np.arange(-cells, cells + 1) * STRIDE
+    reach = int(np.ceil((length / 2 + (ACROSS + 1) * spacing) / STRIDE))
+    on = np.arange(-reach, reach + 1) * STRIDE
+    # A track may run aslant, at 45° at the most.
+    inside = np.abs(on) <= length / 2 + np.abs(across)[:, None]
+    normal = np.array([-along[1], along[0]])
+    places = middle + on[None, :, None] * along + across[:, None, None] * normal
+    distance = tree.query(places[inside], distance_upper_bound=radius)[0]
+    free = np.zeros(inside.shape, dtype=bool)
+    free[inside] = np.isinf(distance)
+    ground = label(free)[0]
+    here = ground[cells - 1 : cells + 2, np.abs(on) <= max(length / 2 - radius, 0) + STRIDE]
+    mine = across[np.isin(ground, here[here > 0]).any(axis=1)]
+    # Open ground keeps a radius from rows: the last that it crosses lies that much nearer.
+    left, right = (max(0.0, float(side.max(initial=0.0))) for side in (mine, -mine))
+    return tuple((side + radius) / spacing - MARGIN if side > 0 else 0.0 for side in (left, right))  # type: ignore[return-value]
