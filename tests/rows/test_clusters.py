@@ -127,14 +127,15 @@ def test_rows_do_not_reach_over_their_headland():
 
 
 def test_rows_stay_in_their_block_beside_one_of_another_direction():
-    """Across a track of 5 m another block's rows, 15° off and unevenly long: whichever ends meet, none is carried over."""
-    rng = np.random.default_rng(2)
-    west = [np.array([[rng.uniform(0, 1), 1.8 * k], [30 - rng.uniform(0, 1), 1.8 * k]]) for k in range(14)]
-    turn = np.radians(15)
+    """Across a track of 5 m stand rows 5° off; where two ends happen to meet, their row isn't carried over."""
+    west = [np.array([[k % 3, 1.8 * k], [30 - 0.3 * (k % 4), 1.8 * k]]) for k in range(14)]
+    turn = np.radians(5)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
-    east = [[37, -6] + 1.8 * k * across + rng.uniform(0, 1) * along for k in range(16)]
-    east = [np.array([start, start + 14 * along]) for start in east]
-    assert_rows_are_kept_apart(cluster_rows(key_points([*west, *east])), 30)
+    starts = [[35.5, 12.8] + 1.85 * (k - 7) * across for k in range(14)]
+    east = [np.array([start, start + 14 * along]) for start in starts]
+    points = key_points([*west, *east])
+    assert_rows_are_kept_apart(cluster_rows(points), 28)
+    assert cluster_rows(points, track_width=50)["cluster"].nunique() < 26
 
 
 def test_gaps_of_some_neighbours_that_line_up_are_no_track():
