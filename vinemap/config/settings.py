@@ -53,11 +53,11 @@ class RowFieldOptions(Options):
     """Direction, spacing and likelihood of rows."""
 
     method: Literal["spectrum", "cylinders"] = Field("spectrum", description="ours, or the thesis's cylinders")
-    window: float = Field(16.0, ge=6, le=60, description="width of the spectrum's windows (m)")
-    radius: float = Field(5.0, ge=2, le=30, description="radius of the cylinders (m)")
+    window: float = Field(18.0, ge=6, le=60, description="width of the spectrum's windows (m)")
+    radius: float = Field(6.5, ge=2, le=30, description="radius of the cylinders (m)")
     step: float = Field(2.0, ge=0.5, le=20, description="distance of the windows (m)")
-    min_spacing: float = Field(1.2, ge=0.8, le=10, description="smallest inter-row spacing (m)")
-    max_spacing: float = Field(4.5, ge=0.8, le=10, description="largest inter-row spacing (m)")
+    min_spacing: float = Field(0.8, ge=0.5, le=10, description="smallest inter-row spacing (m)")
+    max_spacing: float = Field(6.0, ge=0.8, le=10, description="largest inter-row spacing (m)")
 
     @model_validator(mode="after")
     def _ordered(self) -> RowFieldOptions:

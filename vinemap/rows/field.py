@@ -31,11 +31,11 @@ def estimate_row_field(
     cover: Raster,
     *,
     method: str = "spectrum",
-    window: float = 16.0,
-    radius: float = 5.0,
+    window: float = 18.0,
+    radius: float = 6.5,
     step: float = 2.0,
-    min_spacing: float = 1.2,
-    max_spacing: float = 4.5,
+    min_spacing: float = 0.8,
+    max_spacing: float = 6.0,
 ) -> RowField:
     """Estimate the row field from canopy cover.
 
