@@ -36,10 +36,10 @@ from vinemap.rows.blocks import group_blocks
 from vinemap.rows.clusters import cluster_rows
 from vinemap.rows.confidence import judge_rows
 from vinemap.rows.curves import trace_rows
+from vinemap.rows.ends import count_missing
 from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
-from vinemap.rows.missing import count_missing
 from vinemap.rows.numbers import describe_rows, number_rows
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.cover import canopy_cover
@@ -152,13 +152,13 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     settings = settings or Settings()
     options = settings.model_dump()
     cloud, dtm, chm = step("DTM", map_surfaces, points, settings)
-    cover = step("Canopy cover", canopy_cover, cloud, **options["cover"])
+    cover, level = step("Canopy cover", canopy_cover, cloud, chm, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
     clusters = step("Clusters", cluster_rows, key_points, **options["clustering"])
     courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
-    limits = {"low": settings.cover.low, "high": settings.cover.high}
-    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, dtm, **limits, **options["fit"])
+    high = settings.cover.high
+    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, level, dtm, high=high, **options["fit"])
     rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
     rows, gaps = count_missing(judge_rows(rows), gaps, **options["missing"])
     return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)

@@ -42,7 +42,7 @@ def test_survey_with_settings(write):
             SURVEY + "settings: {ground: {resolution: 0}}\n",
             "settings.ground.resolution = 0: input should be greater than or equal to 0.05",
         ),
-        (SURVEY + "settings: {cover: {low: 3}}\n", r"low (3.0) must be below high (2.9)"),
+        (SURVEY + "settings: {cover: {low: 4}}\n", r"low (4.0) must be below high (3.6)"),
         (SURVEY + "settings: {polygon: {c: 4}}\n", "settings.polygon.c = 4"),
         ("parcels: [F]\n", "survey is missing"),
         ("survey: ../x\nparcels: [F]\n", "'../x' can't name a file"),

@@ -7,7 +7,7 @@ import shapely
 
 from vinemap.rows.blocks import group_blocks, outline_blocks
 from vinemap.rows.confidence import judge_rows
-from vinemap.rows.missing import count_missing, estimate_vine_spacing
+from vinemap.rows.ends import count_missing, estimate_vine_spacing
 
 
 def rows_frame(lines, spacing=2.5, **columns):

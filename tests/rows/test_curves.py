@@ -55,9 +55,14 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
     return Scene(points, Raster(cover, grid, UTM), PointCloud(xyz, UTM, heights=xyz[:, 2] - 7), dtm)
 
 
+def level_of(scene):
+    """Half a metre everywhere."""
+    return Raster(np.full_like(scene.cover.values, 0.5), scene.cover.grid, UTM)
+
+
 def fit(scene):
     courses = trace_rows(scene.key_points, scene.cover)
-    return fit_rows(courses, scene.cloud, scene.cover, scene.dtm)
+    return fit_rows(courses, scene.cloud, scene.cover, level_of(scene), scene.dtm)
 
 
 def arc(radius=40.0, angle=1.0, n=200):
@@ -107,7 +112,7 @@ def test_wiggle_of_key_points_does_not_reach_the_curve():
 def test_no_courses():
     empty = scene([np.array([[0, 0], [10.0, 0]])])
     courses = trace_rows(empty.key_points.iloc[:0], empty.cover)
-    rows, gaps = fit_rows(courses, empty.cloud, empty.cover, empty.dtm)
+    rows, gaps = fit_rows(courses, empty.cloud, empty.cover, level_of(empty), empty.dtm)
     assert len(rows) == len(gaps) == 0
 
 
@@ -146,6 +151,6 @@ def test_a_bush_as_long_as_a_row_is_none():
     courses = gpd.GeoDataFrame(
         {"spacing_m": [4.5], "alone": [True]}, geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])], crs=UTM
     )
-    assert len(fit_rows(courses, bush.cloud, bush.cover, bush.dtm)[0]) == 0
+    assert len(fit_rows(courses, bush.cloud, bush.cover, level_of(bush), bush.dtm)[0]) == 0
     row = scene([np.array([[0, 0], [12.0, 0]])], width=0.7)
-    assert len(fit_rows(courses, row.cloud, row.cover, row.dtm)[0]) == 1
+    assert len(fit_rows(courses, row.cloud, row.cover, level_of(row), row.dtm)[0]) == 1

@@ -1,20 +1,18 @@
 """Row field against waves and vineyards of known direction and spacing."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from pyproj import CRS
 
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
-from vinemap.geo.raster import Grid, Raster, grid_over
+from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.field import estimate_row_field
 from vinemap.simulate.plants import Vineyard
-from vinemap.simulate.rays import Obstacle
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate
 from vinemap.simulate.terrain import hillside
+from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
 
@@ -67,7 +65,8 @@ def test_curved_rows_on_a_slope():
     rows = rows_of(10, length=60, radius=40)
     survey = simulate([Vineyard("A", rows, dead=0.1)], hillside(0.2), seed=5)
     cloud = PointCloud(survey.xyz, parse_crs("EPSG:32632"))
-    cover = canopy_cover(cloud.above(terrain_model(cloud)))
+    cloud = cloud.above(terrain_model(cloud))
+    cover, _ = canopy_cover(cloud, canopy_height_model(cloud))
     field = estimate_row_field(cover)
     truth, places = [], []
     for row in rows[1:-1]:
@@ -82,20 +81,3 @@ def test_curved_rows_on_a_slope():
     assert np.median(error) < 1.0
     assert np.quantile(error, 0.95) < 4
     assert np.median(field.spacing.values[i, j]) == pytest.approx(2.5, rel=0.03)
-
-
-def test_cover_does_not_follow_density_and_leaves_trees_out(vineyard, cloud):
-    cloud = cloud.above(terrain_model(cloud))
-    half = np.random.default_rng(0).random(cloud.size) < 0.5
-    dense = canopy_cover(cloud, smoothing=0.2)
-    sparse = canopy_cover(replace(cloud, xyz=cloud.xyz[half], heights=cloud.heights[half]), smoothing=0.2)
-    assert np.abs(dense.values.mean() - sparse.values.mean()) < 0.05 * dense.values.mean()
-
-    rows = rows_of(1, length=20)
-    x, y = rows[0].mean(axis=0) + [0, 6]
-    survey = simulate([Vineyard("A", rows)], hillside(0.1), obstacles=[Obstacle(x, y, 2.0, 2.0, 6.0, 1.0)], seed=1)
-    tree = PointCloud(survey.xyz, cloud.crs)
-    cover = canopy_cover(tree.above(terrain_model(tree)))
-    grid = grid_over(*tree.extent, resolution=0.1)
-    gx, gy = np.meshgrid(*grid.centres())
-    assert cover.values[np.hypot(gx - x, gy - y) < 1.5].max() < 0.05

@@ -48,7 +48,7 @@ def cut_sections(
     min_points: int = 45,
     max_width: float = 1.0,
     low: float = 0.5,
-    high: float = 2.9,
+    high: float = 3.6,
 ) -> list[T]:
     """Cut sections along every row, except where it has no canopy (Eq. 2–3), and make something of each row's.
 

@@ -38,8 +38,8 @@ class CoverOptions(Options):
     """Raster of canopy cover."""
 
     resolution: float = Field(0.1, ge=0.02, le=0.5, description="cell size (m)")
-    low: Metres = Field(0.5, description="height above ground at which canopy begins (m)")
-    high: Metres = Field(2.9, description="height above ground at which it ends (m)")
+    low: Metres = Field(0.5, description="height above ground at which canopy begins, or less where all is low (m)")
+    high: Metres = Field(3.6, description="height above ground at which it ends (m)")
     smoothing: float | None = Field(None, gt=0, le=1, description="Gaussian (m); none: the mean point distance")
 
     @model_validator(mode="after")

@@ -35,6 +35,8 @@ BESIDE = 1.3
 """Spacings within which a row runs beside another."""
 LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
 """Canopy and width of a row, in those of the parcel's typical row."""
+CLOSED = 0.9
+"""Spacings across which the canopy of a row may be closed."""
 ZIGZAG = 12.0
 """Wavelength in metres below which the course of the key points is noise."""
 SMOOTHING = 6.0
@@ -75,7 +77,7 @@ def trace_rows(
     min_radius : float
         Radius in metres of the tightest bend that a row takes as a whole.
     max_width : float
-        Metres of canopy across beyond which it isn't a vine row.
+        Metres of canopy across beyond which it isn't a vine row, nine tenths of the spacing at the least.
     min_support : float
         Share of its length on which a row must have canopy.
 
@@ -94,7 +96,7 @@ def trace_rows(
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
         between = float(np.median(spacing[members]))
         course = _centred(ordered, cover, between) if len(ordered) > 1 else None
-        if course is None or course.width > max_width or course.support < min_support:
+        if course is None or course.width > max(max_width, CLOSED * between) or course.support < min_support:
             return None
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
@@ -227,7 +229,9 @@ def _repeated(rows: gpd.GeoDataFrame) -> Flags:
 def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
     """Whether a row has about as much canopy as most of those that it stands among: no wire between posts, no hedge."""
     out = np.ones(len(rows), dtype=bool)
-    beside = coo_array((np.ones(len(pairs := _neighbours(rows))), tuple(pairs.T)), shape=(len(rows), len(rows)))
+    pairs = _neighbours(rows)
+    enclosed = _enclosed(rows, pairs)
+    beside = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(rows), len(rows)))
     group = connected_components(beside, directed=False)[1]
     length, amount, width = (np.asarray(v) for v in (rows.length, rows["amount"], rows["width"]))
     for members in (np.flatnonzero(group == g) for g in np.unique(group)):
@@ -237,7 +241,20 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
         half = np.cumsum(length[order]) >= 0.5 * length[members].sum()
         typical = order[np.argmax(half)]
         out[members] = amount[members] >= LEAST_AMOUNT * amount[typical]
-        out[members] &= width[members] <= MOST_WIDTH * width[typical]
+        out[members] &= (width[members] <= MOST_WIDTH * width[typical]) | enclosed[members]
+    return out
+
+
+def _enclosed(rows: gpd.GeoDataFrame, pairs: Ints) -> Flags:
+    """Whether rows stand on both sides of each, so that it is no hedge along the vineyard, however wide."""
+    lines = rows["simple"].to_numpy()
+    sides = np.zeros((2, len(rows)), dtype=bool)
+    for i, j in pairs:
+        (ax, ay), (bx, by) = shapely.get_coordinates(lines[i])[[0, -1]]
+        mx, my = shapely.get_coordinates(shapely.line_interpolate_point(lines[j], 0.5, normalized=True))[0]
+        sides[int((bx - ax) * (my - ay) - (by - ay) * (mx - ax) > 0), i] = True
+    wide = rows["width"].to_numpy() <= CLOSED * rows["spacing_m"].to_numpy()
+    out: Flags = sides.all(axis=0) & wide
     return out
 
 

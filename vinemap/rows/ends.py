@@ -1,4 +1,4 @@
-"""Ends and gaps of a row: where the canopy along it begins and stops."""
+"""Ends and gaps of a row: where the canopy along it begins and stops, and how many vines are missing between."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from vinemap.geo.curve import between, way_along
 from vinemap.rows.centre_line import CELL, runs_above
 
 if TYPE_CHECKING:
+    import geopandas as gpd
+
     from vinemap.compute.arrays import Values
 
 AROUND = 0.3
 """Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
+NARROWEST, WIDEST = 0.7, 1.6
+"""Metres between vines of a row, at the least and at the most."""
+USUAL = 1.0
+"""Metres between vines that are taken where nothing tells."""
 
 
 class Standing(NamedTuple):
@@ -52,3 +58,45 @@ def cut_to_canopy(curve: Values, image: Values, end_share: float) -> Standing | 
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
     return Standing(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
+
+
+def count_missing(
+    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, vine_spacing: float | None = None
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Count the vines missing in every gap.
+
+    Parameters
+    ----------
+    rows, gaps : GeoDataFrame
+        With ``row_id``; gaps with ``start_m``, ``end_m`` and ``length_m``.
+    vine_spacing : float, optional
+        Metres between vines in a row; by default estimated from the gaps, and 1 m where they tell nothing.
+
+    Returns
+    -------
+    rows, gaps : GeoDataFrame
+        With ``n_missing``; rows with ``vine_spacing_m`` too.
+    """
+    spacing = vine_spacing or estimate_vine_spacing(gaps) or USUAL
+    n = np.maximum(1, np.rint(gaps["length_m"].to_numpy() / spacing)).astype(np.int64)
+    gaps = gaps.assign(n_missing=n)
+    missing = gaps.groupby("row_id")["n_missing"].sum().reindex(rows["row_id"], fill_value=0)
+    return rows.assign(n_missing=missing.to_numpy(), vine_spacing_m=spacing), gaps
+
+
+def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
+    """Distance of vines in metres, from where gaps begin and end along their rows.
+
+    Vines stand at equal distances, so the beginnings of a row's gaps lie whole numbers of vines apart, and so do
+    their ends. The spacing is where the sum of the rows' periodograms peaks; None where the peak isn't clear.
+    """
+    frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
+    power, spread = np.zeros(len(frequency)), 0.0
+    for _, row in gaps.groupby("row_id"):
+        for edge in ("start_m", "end_m"):
+            at = row[edge].to_numpy()
+            power += np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
+            spread += len(at) * (len(at) - 1)
+    # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
+    clear = spread > 0 and power.max() > 5 * np.sqrt(spread)
+    return float(1 / frequency[power.argmax()]) if clear else None

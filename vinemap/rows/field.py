@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.ndimage import map_coordinates, maximum_filter
+from scipy.ndimage import distance_transform_edt, map_coordinates, maximum_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from vinemap.geo.curve import at
@@ -25,6 +27,10 @@ if TYPE_CHECKING:
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
+ALIKE, LIKE_SPACING = np.radians(10), 1.15
+"""Radians of turn, and ratio of spacings, up to which windows beside each other have the same wave."""
+FAR_STRONGER = 4.0
+"""Strength of a block over that of windows which it may decide."""
 
 
 def estimate_row_field(
@@ -60,7 +66,7 @@ def estimate_row_field(
     band = (min_spacing, max_spacing)
     scan, size = (scan_cylinders, radius) if method == "cylinders" else (scan_spectrum, window)
     peaks = scan(base.values, size, step, band)
-    peaks = _axial_median(peaks)
+    peaks = _settled(_axial_median(peaks), least=(window / 2 / step) ** 2)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
     return _resample(peaks, grid, base.grid, stride, cover)
@@ -98,6 +104,49 @@ def _axial_median(peaks: Peaks) -> Peaks:
     spacing = np.take_along_axis(spacings, best, 0)[0]
     empty = peaks.strength == 0
     return Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
+
+
+def _settled(peaks: Peaks, *, least: float) -> Peaks:
+    """Give windows that disagree with the block about them that block's wave.
+
+    Windows beside each other with about the same wave belong together. Fewer of them than ``least`` are no block of
+    their own where they touch one that is far stronger: gaps that line up, or a row's vines, have deceived them.
+    """
+    my, mx = peaks.direction.shape
+    index = np.arange(my * mx).reshape(my, mx)
+    held = peaks.strength > 0
+    pairs = np.concatenate(
+        [
+            np.column_stack([index[a].ravel(), index[b].ravel()])
+            for a, b in (
+                (np.s_[:, :-1], np.s_[:, 1:]),
+                (np.s_[:-1], np.s_[1:]),
+                (np.s_[:-1, :-1], np.s_[1:, 1:]),
+                (np.s_[:-1, 1:], np.s_[1:, :-1]),
+            )
+        ]
+    )
+    pairs = pairs[held.ravel()[pairs].all(axis=1)]
+    one, other = pairs.T
+    direction, spacing = peaks.direction.ravel(), peaks.spacing.ravel()
+    turn = np.abs(np.angle(np.exp(2j * (direction[one] - direction[other])))) / 2
+    alike = (turn < ALIKE) & (np.abs(np.log(spacing[one] / spacing[other])) < np.log(LIKE_SPACING))
+    graph = coo_array((np.ones(alike.sum()), (one[alike], other[alike])), shape=(my * mx, my * mx))
+    block = connected_components(graph, directed=False)[1]
+    mass, n = np.bincount(block, weights=peaks.strength.ravel()), np.bincount(block, weights=held.ravel())
+    strongest = np.zeros(len(mass))  # of the blocks that touch each
+    a, b = np.concatenate([block[pairs], block[pairs[:, ::-1]]]).T
+    np.maximum.at(strongest, a, np.where(a == b, 0.0, mass[b]))
+    doubtful = ((n < least) & (strongest > FAR_STRONGER * mass))[block].reshape(my, mx) & held
+    sure = held & ~doubtful
+    if not (doubtful.any() and sure.any()):
+        return peaks
+    i, j = distance_transform_edt(~sure, return_distances=False, return_indices=True)
+    return Peaks(
+        np.where(doubtful, peaks.direction[i, j], peaks.direction),
+        np.where(doubtful, peaks.spacing[i, j], peaks.spacing),
+        peaks.strength,
+    )
 
 
 def _resample(peaks: Peaks, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:

@@ -66,10 +66,10 @@ def fit_rows(
     courses: gpd.GeoDataFrame,
     cloud: Cloud,
     cover: Raster,
+    level: Raster,
     dtm: Raster,
     *,
-    low: float = 0.5,
-    high: float = 2.9,
+    high: float = 3.6,
     smoothing: float = 2.5,
     end_share: float = 0.6,
     min_gap: float = 0.8,
@@ -84,10 +84,12 @@ def fit_rows(
         The parcel's points with their heights above ground.
     cover : Raster
         Canopy cover; where it is zero there are trees or houses, whose points don't count.
+    level : Raster
+        Height in metres from which points count as canopy.
     dtm : Raster
         Terrain, which gives curves their elevation.
-    low, high : float
-        Heights in metres between which points count as canopy.
+    high : float
+        Height in metres up to which they do.
     smoothing : float
         Wavelength in metres below which bends of the centre line are taken for noise, at 200 canopy points a metre of
         row; it grows with the fifth root of their distance.
@@ -106,7 +108,7 @@ def fit_rows(
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
     fits: dict[int, Standing | None] = {}
-    for group, shares in _deal(cloud, cover, curves, half, low, high):
+    for group, shares in _deal(cloud, cover, level, curves, half, high):
         found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
         fits |= dict(zip(group.tolist(), found, strict=True))
     rows: list[tuple[object, ...]] = []
@@ -152,7 +154,7 @@ def _smooth_course(course: Values) -> Values:
 
 
 def _deal(
-    cloud: Cloud, cover: Raster, curves: Sequence[Values], half: Values, low: float, high: float
+    cloud: Cloud, cover: Raster, level: Raster, curves: Sequence[Values], half: Values, high: float
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
     vines = cover.values > 0
@@ -160,7 +162,9 @@ def _deal(
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
         canopy = np.zeros(len(member), dtype=np.float32)
         in_threads(
-            lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, vines, cover.grid, (low, high), canopy),
+            lambda stretch: _weigh(
+                *stretch, part.xyz, part.heights, member, (vines, cover.grid), (level.values, level.grid), high, canopy
+            ),
             stretches(len(canopy)),
         )
         return (canopy,)
@@ -183,18 +187,18 @@ def _weigh(
     xyz: Values,
     heights: Values,
     member: NDArray[np.int32],
-    vines: Flags,
-    grid: Grid,
-    limits: tuple[float, float],
+    vines: tuple[Flags, Grid],
+    level: tuple[Values, Grid],
+    high: float,
     canopy: Values,
 ) -> None:
-    """How far members (n,) of a cloud are canopy, 0 to 1: between two heights, and where there are vines."""
-    low, high = limits
+    """How far members (n,) of a cloud are canopy, 0 to 1: from the level up to a height, where there are vines."""
     for k in range(first, last):
         p = member[k]
-        i, j = nearest_cell(grid, xyz[p, 0], xyz[p, 1])
-        if vines[i, j]:
-            rise = min(max((heights[p] - low) / RAMP + 0.5, 0.0), 1.0)
+        i, j = nearest_cell(vines[1], xyz[p, 0], xyz[p, 1])
+        if vines[0][i, j]:
+            a, b = nearest_cell(level[1], xyz[p, 0], xyz[p, 1])
+            rise = min(max((heights[p] - level[0][a, b]) / RAMP + 0.5, 0.0), 1.0)
             canopy[k] = rise * min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import geopandas as gpd
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
     from vinemap.rows.waves import RowField
 
 BATCH = 5_000
+WIDE = (1.0, 1.5, 2.0, 3.0)
+"""Multiples of the smoothing for canopies that are the wider."""
+WIDTH_SHARE = 0.3
+"""Standard deviation of the smoothing, in widths of the canopy."""
 SLICES = 3
 """Lines across the rows that are averaged in a slice."""
 
@@ -51,7 +56,8 @@ def detect_key_points(
     grid_step, slice_width, bin_width : float
         Distance of the nodes, width of the slice along the rows and of the profile's bins, in metres.
     smoothing : float
-        Standard deviation in metres of the Gaussian that smooths a profile: a hollow canopy has one maximum, not two.
+        Standard deviation in metres of the Gaussian that smooths a profile, at the least: a hollow canopy has one
+        maximum, not two.
     reach : float
         How far a profile reaches to both sides, in inter-row spacings. The thesis's cylinders of 5 m reach 2.
     min_cover, min_likelihood : float
@@ -66,9 +72,9 @@ def detect_key_points(
 
     def maxima(batch: Values) -> Values:
         # Beyond its reach a profile goes on for what the Gaussian needs.
-        margin = 4 * smoothing + bin_width
+        margin = 4 * WIDE[-1] * smoothing + bin_width
         profile, offsets = _profiles(cover, batch, reach * batch[:, 3].max() + margin, slice_width, bin_width)
-        profile = gaussian_filter1d(profile, smoothing / bin_width, axis=1)
+        profile = _smoothed(profile, offsets, batch[:, 3], smoothing)
         return _maxima(profile, offsets, batch, reach, min_cover)
 
     batches = [nodes[start : start + BATCH] for start in range(0, len(nodes), BATCH)]
@@ -118,6 +124,20 @@ def _profiles(
     for along in np.linspace(-slice_width / 2, slice_width / 2, SLICES):
         profile += sample_across(cover, origin + along * tangent, normal, offsets)
     return profile / SLICES, offsets
+
+
+def _smoothed(profile: Values, offsets: Values, spacing: Values, smoothing: float) -> Values:
+    """Profiles (n, bins) smoothed by a Gaussian, the wider the wider the canopy in them: a broad top has one middle."""
+    step = offsets[1] - offsets[0]
+    inside = np.abs(offsets) <= 0.5 * spacing[:, None]
+    highest = np.maximum((profile * inside).max(axis=1), 1e-9)
+    width = (profile * inside).sum(axis=1) * step / highest
+    wanted = np.digitize(WIDTH_SHARE * width / smoothing, [(a + b) / 2 for a, b in pairwise(WIDE)])
+    out = np.empty_like(profile)
+    for k, factor in enumerate(WIDE):
+        mine = wanted == k
+        out[mine] = gaussian_filter1d(profile[mine], factor * smoothing / step, axis=1)
+    return out
 
 
 def _maxima(profile: Values, offsets: Values, nodes: Values, reach: float, min_cover: float) -> Values:

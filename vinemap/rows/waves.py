@@ -156,9 +156,9 @@ def _strongest(
                     continue
                 # A real signal's spectrum is symmetric: the half that is kept holds the column j = 0 whole.
                 total += power[row, j] if j else 0.5 * power[row, j]
-                if lowest <= square <= highest and power[row, j] > most:
+                if lowest <= square <= highest and power[row, j] > most and _is_peak(power, i, j):
                     most, best_i, best_j = power[row, j], i, j
-        if most < 0:  # no bin lies in so narrow a band
+        if most < 0:  # no peak lies in the band
             y[k], x[k], strength[k] = 0.0, 1 / longest, 0.0
             continue
         held = 0.0
@@ -172,6 +172,20 @@ def _strongest(
         north, south = np.log(power[best_i - 1, best_j] + 1e-12), np.log(power[best_i + 1, best_j] + 1e-12)
         y[k] = (best_i + _vertex(north, here, south)) / unit
     return y, x, strength
+
+
+@compiled
+def _is_peak(power: Values, i: int, j: int) -> bool:
+    """Whether no bin beside one of a spectrum (n, n/2 + 1) holds more: at the band's end may stand a slope's foot."""
+    half = power.shape[1] - 1
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            row, column = i + a, j + b
+            if column < 0:
+                row, column = -row, -column
+            if -half <= row < half and column <= half and power[row, column] > power[i, j]:
+                return False
+    return True
 
 
 @compiled

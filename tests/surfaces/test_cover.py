@@ -1,0 +1,58 @@
+"""Canopy cover: a share, from a level that follows the canopies' height."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vinemap.cloud.points import PointCloud
+from vinemap.geo.raster import grid_over, sample
+from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
+from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.survey import simulate
+from vinemap.simulate.terrain import hillside
+from vinemap.surfaces.canopy_height import canopy_height_model
+from vinemap.surfaces.cover import canopy_cover
+from vinemap.surfaces.ground import terrain_model
+
+
+def test_cover_does_not_follow_density_and_leaves_trees_out(vineyard, cloud):
+    cloud = cloud.above(terrain_model(cloud))
+    half = np.random.default_rng(0).random(cloud.size) < 0.5
+    chm = canopy_height_model(cloud)
+    dense, _ = canopy_cover(cloud, chm, smoothing=0.2)
+    sparse, _ = canopy_cover(replace(cloud, xyz=cloud.xyz[half], heights=cloud.heights[half]), chm, smoothing=0.2)
+    assert np.abs(dense.values.mean() - sparse.values.mean()) < 0.05 * dense.values.mean()
+
+    rows = rows_of(1, length=20)
+    x, y = rows[0].mean(axis=0) + [0, 6]
+    survey = simulate([Vineyard("A", rows)], hillside(0.1), obstacles=[Obstacle(x, y, 2.0, 2.0, 6.0, 1.0)], seed=1)
+    tree = PointCloud(survey.xyz, cloud.crs)
+    tree = tree.above(terrain_model(tree))
+    cover, _ = canopy_cover(tree, canopy_height_model(tree))
+    grid = grid_over(*tree.extent, resolution=0.1)
+    gx, gy = np.meshgrid(*grid.centres())
+    assert cover.values[np.hypot(gx - x, gy - y) < 1.5].max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("vines", "spacing", "least", "most"),
+    [
+        ({}, 2.5, 0.5, 0.5),
+        ({"height": 0.6, "half_width": 0.1, "bottom": 0.1, "leafiness": 20}, 2.5, 0.2, 0.3),
+        ({"height": 1.7, "half_width": 1.1, "leafiness": 6}, 2.4, 1.2, 1.5),
+    ],
+)
+def test_the_level_follows_the_canopies(cloud, vines, spacing, least, most):
+    """Ordinary rows, vines that were planted this year, and canopies that touch below their tops."""
+    rows = rows_of(8, length=25, spacing=spacing)
+    survey = simulate([Vineyard("A", rows, dead=0, **vines)], hillside(0.05), weeds=0.1, density=300, seed=2)
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    cover, level = canopy_cover(points, canopy_height_model(points))
+    at = [row[len(row) // 4 : 3 * len(row) // 4] for row in rows[2:-2]]
+    found = np.concatenate([sample(level, xy) for xy in at])
+    assert least <= found.min() <= np.median(found) <= most
+    beside = np.concatenate([sample(cover, xy + [0, spacing / 2]) for xy in at])
+    assert np.median(beside) < 0.5 * np.median(np.concatenate([sample(cover, xy) for xy in at]))

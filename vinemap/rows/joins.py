@@ -1,0 +1,199 @@
+"""Pieces of rows joined end to end: over missing vines, but not over tracks, headlands or kinks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import label
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from vinemap.compute.arrays import Flags, Ints, Values
+
+TANGENT_LENGTH = 5.0
+"""Metres of a piece's end that tell its tangent."""
+BEND_LENGTH = 10.0
+"""Metres of a piece's end that tell how it bends."""
+KINK = 0.16
+"""Radians that a gap may turn a row beyond what the pieces on both sides do."""
+THEREABOUTS, SEVERAL = 25.0, 5
+"""Metres within which other pieces, and so many of them, tell how a piece bends that is too short for it."""
+SHORT = 2.5
+"""Metres below which a piece is too short to tell its own direction: the row field does."""
+FLANK = 4.0
+"""Metres before and after a gap in which the rows stand that must end there for it to be a track."""
+ACROSS = 6
+"""Rows on each side of a gap that are looked at for a track."""
+OPEN = 0.62
+"""Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
+STRIDE = 0.5
+"""Metres between the places at which ground is looked at."""
+MARGIN = 0.5
+"""Spacings by which a row must be crossed."""
+OVERLAP = 0.5
+"""Metres by which two pieces of a row may lie side by side at their ends."""
+
+
+class Ends(NamedTuple):
+    """Both ends of every piece; ends 2 p and 2 p + 1 are those of piece p."""
+
+    xy: Values
+    tangent: Values
+    """Outward unit vectors (2 m, 2) of the piece's last metres."""
+    field: Values
+    """Outward unit vectors (2 m, 2) of the row field there."""
+    spacing: Values
+    bend: Values
+    """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
+
+
+def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, position: Values) -> Ends:
+    """Ends of pieces of key points (n, 2), whose place along their piece is ``position`` (n,) in metres."""
+    order = np.lexsort((position, pieces))
+    first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
+    n = 2 * (len(first) - 1)
+    out = Ends(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
+    for p in range(len(first) - 1):
+        members = order[first[p] : first[p + 1]]
+        s = position[members]
+        for end, depth in ((2 * p, s), (2 * p + 1, s[-1] - s)):
+            near = members[depth <= TANGENT_LENGTH]
+            middle = xy[near].mean(axis=0)
+            half = np.angle(np.exp(2j * direction[near]).sum()) / 2
+            outward = xy[members[depth.argmin()]] - middle
+            out.field[end] = _like(np.array([np.cos(half), np.sin(half)]), outward)
+            axis = np.linalg.svd(xy[near] - middle, full_matrices=False)[2][0]
+            tangent = _like(axis, outward) if s[-1] > SHORT else out.field[end]
+            out.tangent[end] = tangent
+            # An end lies on its piece's axis rather than on the outermost point.
+            out.xy[end] = middle + ((xy[near] - middle) @ tangent).max() * tangent
+            out.spacing[end] = np.median(spacing[near])
+            if s[-1] >= BEND_LENGTH:
+                offset = xy[members[depth <= BEND_LENGTH]] - middle
+                left = tangent[0] * offset[:, 1] - tangent[1] * offset[:, 0]
+                out.bend[end] = 2 * np.polyfit(offset @ tangent, left, 2)[0]
+    return out
+
+
+def candidates(ends: Ends, max_gap: float) -> Ints:
+    """Pairs of ends (k, 2) that may belong together, the best first.
+
+    The lateral mismatch is measured from the tangents of both ends (the mean of the two vanishes on an arc) and
+    from the row field's direction; the smaller counts. It stays below 0.25 m + 5% of the gap and 0.36 spacings.
+    """
+    pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
+    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
+    a, b = pairs.T
+    gap = ends.xy[b] - ends.xy[a]
+    length = np.hypot(*gap.T)
+
+    def mismatch(outward: Values) -> Values:
+        turn = outward[a] - outward[b]
+        out: Values = np.abs(turn[:, 0] * gap[:, 1] - turn[:, 1] * gap[:, 0]) / 2
+        return out
+
+    lateral = np.minimum(mismatch(ends.tangent), mismatch(ends.field))
+    ahead = np.minimum((ends.field[a] * gap).sum(axis=1), -(ends.field[b] * gap).sum(axis=1))
+    facing = (ahead >= 0.7 * length - OVERLAP) & ((ends.field[a] * ends.field[b]).sum(axis=1) < -0.7)
+    gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
+    fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
+    cost = length[fits] + 10 * lateral[fits]
+    out: Ints = pairs[fits][np.argsort(cost, kind="stable")]
+    return out
+
+
+def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: float) -> Flags:
+    """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
+
+    What lies farther than half a track from all key points is open ground. The gap lies on a track if the open ground
+    about its middle goes on across all the rows that stand beside its ends, up to ``ACROSS`` on each side: missing
+    vines of some neighbours may line up, those of all don't.
+    """
+    tree = cKDTree(xy)
+    out = np.zeros(len(pairs), dtype=bool)
+    for k, (a, b) in enumerate(pairs):
+        gap = ends.xy[b] - ends.xy[a]
+        length = float(np.hypot(*gap))
+        if length < track_width:
+            continue
+        spacing = float(ends.spacing[[a, b]].mean())
+        middle, along = (ends.xy[a] + ends.xy[b]) / 2, gap / length
+        around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
+        near = xy[tree.query_ball_point(middle, around)] - middle
+        x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
+        beside = (np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)
+        standing = np.unique(np.rint(y[beside]).astype(int))
+        open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
+        sides = [side[(side >= 1) & (side <= ACROSS)] for side in (standing, -standing)]
+        out[k] = sum(map(len, sides)) > 1 and all((s <= far).all() for s, far in zip(sides, open_to, strict=True))
+    return out
+
+
+def join(pairs: Ints, n_ends: int) -> Ints:
+    """Row (m,) of each piece: ends are paired in the order of ``pairs`` (k, 2), each end once."""
+    rows = np.arange(n_ends // 2)
+    taken = np.zeros(n_ends, dtype=bool)
+    for a, b in pairs:
+        one, other = rows[a // 2], rows[b // 2]
+        if not (taken[a] or taken[b] or one == other):
+            taken[[a, b]] = True
+            rows[rows == other] = one
+    out: Ints = np.unique(rows, return_inverse=True)[1]
+    return out
+
+
+def _like(axis: Values, way: Values) -> Values:
+    return axis if axis @ way >= 0 else -axis
+
+
+def _kinked(ends: Ends, a: Ints, b: Ints, length: Values) -> Flags:
+    """Whether two ends (k,) could only be joined by a bend that neither of their pieces, where long enough, has."""
+    (ax, ay), (bx, by) = ends.tangent[a].T, -ends.tangent[b].T
+    turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+    own = _bends(ends)
+    bends = np.stack([own[a], -own[b]])
+    known = np.isfinite(bends)
+    bend = np.where(known, bends, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    # Tangents are those of the middle of the pieces' last metres.
+    out: Flags = known.any(axis=0) & (np.abs(turn - bend * (length + TANGENT_LENGTH)) > KINK)
+    return out
+
+
+def _bends(ends: Ends) -> Values:
+    """Curvature (2 m,) at every end, of pieces that are too short to tell that of the others thereabouts."""
+    known = np.flatnonzero(np.isfinite(ends.bend))
+    unknown = np.flatnonzero(~np.isfinite(ends.bend))
+    out = ends.bend.copy()
+    if len(known) < SEVERAL or len(unknown) == 0:
+        return out
+    distance, nearest = cKDTree(ends.xy[known]).query(ends.xy[unknown], SEVERAL, distance_upper_bound=THEREABOUTS)
+    near = known[np.minimum(nearest, len(known) - 1)]
+    # The same bend is to the left on the way out of one end, and to the right out of the other.
+    sense = np.sign((ends.tangent[near] * ends.tangent[unknown][:, None]).sum(axis=2))
+    told = np.isfinite(distance).all(axis=1)
+    out[unknown[told]] = np.median(sense * ends.bend[near], axis=1)[told]
+    return out
+
+
+def _open_across(
+    tree: cKDTree, middle: Values, along: Values, length: float, spacing: float, radius: float
+) -> tuple[float, float]:
+    """Rows to the left and to the right up to which the open ground about the middle of a gap goes on."""
+    cells = int(np.ceil((ACROSS + 1) * spacing / STRIDE))
+    across = np.arange(-cells, cells + 1) * STRIDE
+    reach = int(np.ceil((length / 2 + (ACROSS + 1) * spacing) / STRIDE))
+    on = np.arange(-reach, reach + 1) * STRIDE
+    # A track may run aslant, at 45° at the most.
+    inside = np.abs(on) <= length / 2 + np.abs(across)[:, None]
+    normal = np.array([-along[1], along[0]])
+    places = middle + on[None, :, None] * along + across[:, None, None] * normal
+    distance = tree.query(places[inside], distance_upper_bound=radius)[0]
+    free = np.zeros(inside.shape, dtype=bool)
+    free[inside] = np.isinf(distance)
+    ground = label(free)[0]
+    here = ground[cells - 1 : cells + 2, np.abs(on) <= max(length / 2 - radius, 0) + STRIDE]
+    mine = across[np.isin(ground, here[here > 0]).any(axis=1)]
+    left, right = (max(0.0, float(side.max(initial=0.0))) for side in (mine, -mine))
+    # Open ground keeps a radius from rows: the last that it crosses lies that much nearer.
+    return (left + radius) / spacing - MARGIN, (right + radius) / spacing - MARGIN
