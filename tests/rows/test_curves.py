@@ -12,6 +12,7 @@ from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.curves import order_key_points, trace_rows
 from vinemap.rows.fit import fit_rows
+from vinemap.surfaces.cover import Levels
 
 UTM = CRS.from_epsg(32632)
 
@@ -57,7 +58,8 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
 
 def level_of(scene):
     """Half a metre everywhere."""
-    return Raster(np.full_like(scene.cover.values, 0.5), scene.cover.grid, UTM)
+    level = Raster(np.full_like(scene.cover.values, 0.5), scene.cover.grid, UTM)
+    return Levels(level, level)
 
 
 def fit(scene):

@@ -50,9 +50,9 @@ def test_the_level_follows_the_canopies(cloud, vines, spacing, least, most):
     survey = simulate([Vineyard("A", rows, dead=0, **vines)], hillside(0.05), weeds=0.1, density=300, seed=2)
     points = PointCloud(survey.xyz, cloud.crs)
     points = points.above(terrain_model(points))
-    cover, level = canopy_cover(points, canopy_height_model(points))
+    cover, levels = canopy_cover(points, canopy_height_model(points))
     at = [row[len(row) // 4 : 3 * len(row) // 4] for row in rows[2:-2]]
-    found = np.concatenate([sample(level, xy) for xy in at])
+    found = np.concatenate([sample(levels.ridge, xy) for xy in at])
     assert least <= found.min() <= np.median(found) <= most
     beside = np.concatenate([sample(cover, xy + [0, spacing / 2]) for xy in at])
     assert np.median(beside) < 0.5 * np.median(np.concatenate([sample(cover, xy) for xy in at]))

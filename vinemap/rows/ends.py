@@ -33,8 +33,11 @@ class Standing(NamedTuple):
     contrast: float
 
 
-def cut_to_canopy(curve: Values, image: Values, end_share: float) -> Standing | None:
-    """Cut a curve to where its canopy begins and ends; None where there is none."""
+def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float) -> Standing | None:
+    """Cut a curve to where its canopy begins and ends; None where there is none.
+
+    Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out.
+    """
     profile = image.sum(axis=1) * CELL
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
@@ -53,7 +56,7 @@ def cut_to_canopy(curve: Values, image: Values, end_share: float) -> Standing | 
     metres = metres[np.diff(metres, axis=1)[:, 0] >= SHORTEST]
     if len(metres) == 0:
         return None
-    canopy = image[profile > edge]
+    canopy = ridge[profile > edge]
     aside = max(1, canopy.shape[1] // 8)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))

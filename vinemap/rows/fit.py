@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Grid
+    from vinemap.surfaces.cover import Levels
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
@@ -53,20 +54,24 @@ VERTEX = 0.5
 
 
 class _Share(NamedTuple):
-    """A row's course (n, 2), the canopy's half width in metres, and points: station, metres to its left, canopy 0–1."""
+    """A row's course (n, 2), the canopy's half width in metres, and points: station, metres to its left, canopy 0–1.
+
+    Canopy is what stands above the level of its body, and that of its ridge.
+    """
 
     curve: Values
     half: float
     station: Values
     left: Values
-    canopy: Values
+    body: Values
+    ridge: Values
 
 
 def fit_rows(
     courses: gpd.GeoDataFrame,
     cloud: Cloud,
     cover: Raster,
-    level: Raster,
+    levels: Levels,
     dtm: Raster,
     *,
     high: float = 3.6,
@@ -84,8 +89,8 @@ def fit_rows(
         The parcel's points with their heights above ground.
     cover : Raster
         Canopy cover; where it is zero there are trees or houses, whose points don't count.
-    level : Raster
-        Height in metres from which points count as canopy.
+    levels : Levels
+        Heights from which points count as canopy: of its ridge for the centre line, of its body for the ends.
     dtm : Raster
         Terrain, which gives curves their elevation.
     high : float
@@ -108,7 +113,7 @@ def fit_rows(
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = half_width(courses["spacing_m"].to_numpy())
     fits: dict[int, Standing | None] = {}
-    for group, shares in _deal(cloud, cover, level, curves, half, high):
+    for group, shares in _deal(cloud, cover, levels, curves, half, high):
         found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
         fits |= dict(zip(group.tolist(), found, strict=True))
     rows: list[tuple[object, ...]] = []
@@ -132,11 +137,14 @@ def fit_rows(
 def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
     """Centre line of a row about its course, between the ends of its canopy."""
     still = np.zeros(len(share.curve))
-    image, offsets = _straighten(share, still)
+    image, offsets = _straighten(share, share.ridge, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
     shift = centre_line(image, offsets, reach=0.75 * share.half, cutoff=cutoff)
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
-    return cut_to_canopy(centred, _straighten(share, shift)[0], end_share)
+    body = ridge = _straighten(share, share.body, shift)[0]
+    if share.ridge is not share.body:
+        ridge = _straighten(share, share.ridge, shift)[0]
+    return cut_to_canopy(centred, body, ridge, end_share)
 
 
 def _smooth_course(course: Values) -> Values:
@@ -154,29 +162,31 @@ def _smooth_course(course: Values) -> Values:
 
 
 def _deal(
-    cloud: Cloud, cover: Raster, level: Raster, curves: Sequence[Values], half: Values, high: float
+    cloud: Cloud, cover: Raster, levels: Levels, curves: Sequence[Values], half: Values, high: float
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
     vines = cover.values > 0
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
-        canopy = np.zeros(len(member), dtype=np.float32)
-        in_threads(
-            lambda stretch: _weigh(
-                *stretch, part.xyz, part.heights, member, (vines, cover.grid), (level.values, level.grid), high, canopy
-            ),
-            stretches(len(canopy)),
-        )
-        return (canopy,)
+        def above(level: Raster) -> Values:
+            canopy = np.zeros(len(member), dtype=np.float32)
+            at = (vines, cover.grid), (level.values, level.grid)
+            in_threads(
+                lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, at, high, canopy),
+                stretches(len(canopy)),
+            )
+            return canopy
 
-    for rows, near, (canopy,) in points_of_rows(cloud, curves, half + REACH, canopy_of):
+        body = above(levels.body)
+        return body, body if levels.ridge is levels.body else above(levels.ridge)
+
+    for rows, near, (body, ridge) in points_of_rows(cloud, curves, half + REACH, canopy_of):
         shares = []
         for k, row in enumerate(rows):
             mine = slice(near.start[k], near.start[k + 1])
             scale = np.float32((len(curves[row]) - 1) / way_along(curves[row])[-1])
-            shares.append(
-                _Share(curves[row], float(half[row]), near.along[mine] * scale, near.left[mine], canopy[mine])
-            )
+            columns = (body[mine],) * 2 if ridge is body else (body[mine], ridge[mine])
+            shares.append(_Share(curves[row], float(half[row]), near.along[mine] * scale, near.left[mine], *columns))
         yield rows, shares
 
 
@@ -187,12 +197,12 @@ def _weigh(
     xyz: Values,
     heights: Values,
     member: NDArray[np.int32],
-    vines: tuple[Flags, Grid],
-    level: tuple[Values, Grid],
+    at: tuple[tuple[Flags, Grid], tuple[Values, Grid]],
     high: float,
     canopy: Values,
 ) -> None:
     """How far members (n,) of a cloud are canopy, 0 to 1: from the level up to a height, where there are vines."""
+    vines, level = at
     for k in range(first, last):
         p = member[k]
         i, j = nearest_cell(vines[1], xyz[p, 0], xyz[p, 1])
@@ -204,14 +214,14 @@ def _weigh(
 
 def _noise_stretch(share: _Share) -> float:
     """Factor of the smoothing's wavelength: 1 at ``POINTS_A_METRE``, more where points are fewer."""
-    per_metre = float(share.canopy[np.abs(share.left) <= share.half].sum()) / (len(share.curve) * CELL)
+    per_metre = float(share.ridge[np.abs(share.left) <= share.half].sum()) / (len(share.curve) * CELL)
     return float(np.clip((POINTS_A_METRE / max(per_metre, 1.0)) ** 0.2, 0.8, 1.6))
 
 
-def _straighten(share: _Share, shift: Values) -> tuple[Values, Values]:
+def _straighten(share: _Share, canopy: Values, shift: Values) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
     m = int(np.ceil(share.half / CELL))
-    leaves, everything = _spread(share.station, share.left, share.canopy, shift, m)
+    leaves, everything = _spread(share.station, share.left, canopy, shift, m)
     density = max(float(everything.mean()), 1e-9)
     sigma = max(1.0, density**-0.5)
     image = gaussian_filter(leaves, sigma) / (gaussian_filter(everything, sigma) + 0.1 * density)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, maximum_filter, uniform_filter
@@ -30,7 +30,9 @@ BLOCK = 0.25
 TALLEST = 40.0
 """Metres above which nothing stands: points there are birds and noise."""
 WIDEST = 2.0
-"""Metres across which no canopy of a row is closed, but near its top."""
+"""Metres across which no canopy of a row is closed near its top."""
+TOUCHING = 1.4
+"""Metres of closed canopy from which rows may touch."""
 ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
 AROUND = 4.0
@@ -45,6 +47,15 @@ RIDGE = 0.75
 """Share of the canopies' height above which rows stand apart that touch below it."""
 
 
+class Levels(NamedTuple):
+    """Heights above ground from which points are canopy, in metres, in cells of 1 m."""
+
+    body: Raster
+    """Of canopies whole."""
+    ridge: Raster
+    """Of what stands apart: the same but where rows touch."""
+
+
 def canopy_cover(
     cloud: Cloud,
     chm: Raster,
@@ -53,7 +64,7 @@ def canopy_cover(
     low: float = 0.5,
     high: float = 3.6,
     smoothing: float | None = None,
-) -> tuple[Raster, Raster]:
+) -> tuple[Raster, Levels]:
     """Share of a cell's points that are canopy: between two heights above ground, and under nothing taller.
 
     A ratio, so that neither the cloud's density nor its unevenness between flight lines matters. The lower height
@@ -78,15 +89,15 @@ def canopy_cover(
     -------
     cover : Raster
         0–1.
-    level : Raster
-        Height in metres from which points count as canopy, in cells of 1 m.
+    levels : Levels
+        Heights from which points count as canopy.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
     top = _canopy_height(chm, high)
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low)
-    level = Raster(foot.astype(np.float32), coarser(chm.grid, resolution=1.0), cloud.crs)
+    body = level = Raster(foot.astype(np.float32), coarser(chm.grid, resolution=1.0), cloud.crs)
     counts = _counts(cloud, grid, level, high)
-    wide = _closed(counts, resolution)
+    wide = _closed(counts, resolution, TOUCHING)
     if wide.any():
         ridge = np.where(_in_cells_of(level.grid, wide, grid, resolution), np.maximum(RIDGE * top, foot), foot)
         level = replace(level, values=ridge.astype(np.float32))
@@ -97,7 +108,7 @@ def canopy_cover(
     cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
     cover /= blurred + np.float32(0.1 * density)
     cover[_no_vines(counts, resolution)] = 0.0
-    return Raster(cover, grid, cloud.crs), level
+    return Raster(cover, grid, cloud.crs), Levels(body, level)
 
 
 def _canopy_height(chm: Raster, high: float) -> Values:
@@ -163,8 +174,8 @@ def _count(
             counts[2, cell] += 1
 
 
-def _closed(counts: Counts, resolution: float) -> Flags:
-    """Blocks of cells over which canopy is closed wider than a row's."""
+def _closed(counts: Counts, resolution: float, width: float) -> Flags:
+    """Blocks of cells over which canopy is closed across some metres."""
     k = max(1, round(BLOCK / resolution))
     everything, low, above = (block_sum(layer, k) for layer in counts)
     if np.median(everything[everything > 0]) < ENOUGH:
@@ -172,7 +183,7 @@ def _closed(counts: Counts, resolution: float) -> Flags:
         closed = low + above > 0.5 * np.maximum(everything, 1)
     else:
         closed = uniform_filter((low + above > 0.5 * np.maximum(everything, 1)).astype(np.float32), 3) > 0.5
-    out: Flags = binary_opening(closed, _disc(WIDEST / 2, _side(resolution)))
+    out: Flags = binary_opening(closed, _disc(width / 2, _side(resolution)))
     return out
 
 
@@ -181,7 +192,7 @@ def _no_vines(counts: Counts, resolution: float) -> Flags:
     k = max(1, round(BLOCK / resolution))
     all_, _, above = _summed(counts, resolution)
     high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
-    out: Flags = binary_dilation(high | _closed(counts, resolution), _disc(0.5, _side(resolution)))
+    out: Flags = binary_dilation(high | _closed(counts, resolution, WIDEST), _disc(0.5, _side(resolution)))
     return out.repeat(k, axis=0).repeat(k, axis=1)[: counts.shape[1], : counts.shape[2]]
 
 
