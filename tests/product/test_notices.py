@@ -1,7 +1,7 @@
 """Remarks on what a product can be trusted for."""
 
+import geopandas as gpd
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
@@ -12,13 +12,14 @@ WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
 
 
-def rows(*confidence):
-    return pd.DataFrame({"confidence": np.array(confidence, dtype=float)})
+def rows(*confidence, lines=None):
+    """Rows with these confidences; where they lie doesn't matter to most remarks."""
+    lines = lines or [shapely.LineString([(0, k), (1, k)]) for k in range(len(confidence))]
+    numbers = {"confidence": np.array(confidence, dtype=float), "spacing_m": 2.5, "height_m": 1.9}
+    return gpd.GeoDataFrame(numbers, geometry=lines, crs=32632)
 
 
 def parcel(*polygons):
-    import geopandas as gpd
-
     return gpd.GeoDataFrame(geometry=list(polygons or [box(0, 0, 60, 40)]), crs=32632)
 
 
@@ -103,3 +104,28 @@ def test_rows_that_are_worth_a_look(full):
 def test_no_points_at_all():
     said = notices(rows(), chm(box(-1, -1, 61, 41)), parcel(), 0)
     assert said == ["the cloud covers 0% of the parcel", "0 points/m², canopies are poor below 60"]
+
+
+def grown(full, *plants, height):
+    """Canopy heights with plants in some boxes."""
+    x, y = np.meshgrid(*full.grid.centres())
+    inside = np.any([shapely.contains_xy(plant, x, y) for plant in plants], axis=0)
+    return Raster(np.where(inside, np.float32(height), full.values), full.grid, full.crs)
+
+
+def test_plants_in_no_row(full):
+    """A roof of leaves, bushes apart, and the same with rows through them; grass and trees are no vines."""
+    roof = grown(full, box(10, 10, 40, 30), height=2.0)
+    (remark,) = notices(rows(), roof, parcel(), int(AREA * 100))
+    assert remark.startswith("plants of 0.5 to 3.6 m stand in no row on 600 m² (25% of the parcel): closed over 3 m")
+    bushes = [box(5 * k, 5 * m, 5 * k + 2, 5 * m + 2) for k in range(10) for m in range(6)]
+    (remark,) = notices(rows(), grown(full, *bushes, height=1.5), parcel(), int(AREA * 100))
+    assert remark.endswith("no rows were seen in them")
+    for height in (0.3, 5.0):
+        assert notices(rows(), grown(full, *bushes, height=height), parcel(), int(AREA * 100)) == []
+    strips = [box(5, 5 * k, 55, 5 * k + 1) for k in range(1, 8)]
+    lines = [shapely.LineString([strip.bounds[:2], (strip.bounds[2], strip.bounds[1])]) for strip in strips]
+    vines = grown(full, *strips, height=1.9)
+    assert notices(rows(*[1] * 7, lines=lines), vines, parcel(), int(AREA * 100)) == []
+    (remark,) = notices(rows(*[1] * 4, lines=lines[:4]), vines, parcel(), int(AREA * 100))
+    assert "on 150 m² (6% of the parcel)" in remark

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from scipy.ndimage import binary_opening
+from scipy.spatial import cKDTree
 
 from vinemap.geo.raster import block_sum
 
@@ -23,17 +25,27 @@ DENSE = 60.0
 """Points a square metre below which canopies come out poorly."""
 SURE = 0.5
 """Confidence of a row that is worth a look."""
+LOWEST, HIGHEST = 0.45, 3.6
+"""Metres of height from which what stands there is no grass, and up to which it may be vines."""
+HALF = 0.5
+"""Share of the rows' height below which what stands between them is no vine; and of a square that plants fill."""
+STEP = 0.5
+"""Metres between the points of rows."""
+ROOF = 3.0
+"""Metres across which plants are closed that are no rows."""
+MOST_LEFT = 0.02
+"""Share of a parcel on which vines may stand that are in no row."""
 
 
 def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_points: int) -> list[str]:
-    """Remarks, a sentence each, on how far the points cover a parcel, how densely, and on doubtful rows.
+    """Remarks, a sentence each: how far points cover a parcel, how densely, doubtful rows, and plants in no row.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        With ``confidence``.
+        LineString with ``confidence``, ``spacing_m`` and ``height_m``.
     chm : Raster
-        Any raster that is NaN where there are no points.
+        Canopy height, NaN where there are no points.
     parcel : GeoDataFrame
         Polygons of the parcel.
     n_points : int
@@ -51,7 +63,39 @@ def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_poi
         f"{density:.0f} points/m², canopies are poor below {DENSE:.0f}": density < DENSE,
         f"{doubtful} of {len(rows)} rows are doubtful (confidence below {SURE:g})": doubtful > 0,
     }
-    return [remark for remark, holds in remarks.items() if holds]
+    return [remark for remark, holds in remarks.items() if holds] + _plants_in_no_row(rows, chm, polygon)
+
+
+def _plants_in_no_row(rows: gpd.GeoDataFrame, chm: Raster, polygon: shapely.Geometry) -> list[str]:
+    """What stands at the height of vines in a parcel, and in none of its rows."""
+    grid = chm.grid
+    heights = rows["height_m"].dropna()
+    low = max(LOWEST, HALF * float(heights.median())) if len(heights) else LOWEST
+    plants = (chm.values >= low) & (chm.values <= HIGHEST)
+    i, j = np.nonzero(plants)
+    x, y = grid.west + (j + 0.5) * grid.resolution, grid.north - (i + 0.5) * grid.resolution
+    left = shapely.contains_xy(polygon, x, y)
+    if len(rows):
+        lines = shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP)
+        points, row = shapely.get_coordinates(lines, return_index=True)
+        half = 0.5 * rows["spacing_m"].to_numpy()[row]
+        distance, nearest = cKDTree(points).query(
+            np.column_stack([x, y]), distance_upper_bound=float(half.max()) + STEP, workers=-1
+        )
+        left &= ~(distance <= half[np.minimum(nearest, len(half) - 1)])
+    plants[i, j] = left
+    n = max(1, round(1 / grid.resolution))
+    squares = block_sum(plants.astype(np.uint16), n) >= HALF * n**2
+    area = float(np.count_nonzero(squares)) * (n * grid.resolution) ** 2
+    share = area / max(float(shapely.area(polygon)), 1.0)
+    if share <= MOST_LEFT:
+        return []
+    side = max(1, round(ROOF / (n * grid.resolution)))
+    roof = np.count_nonzero(binary_opening(squares, np.ones((side, side)))) > HALF * np.count_nonzero(squares)
+    why = f"closed over {ROOF:g} m and more, so that no rows can be told" if roof else "no rows were seen in them"
+    return [
+        f"plants of {low:.1f} to {HIGHEST:g} m stand in no row on {area:,.0f} m² ({share:.0%} of the parcel): {why}"
+    ]
 
 
 def _covered(polygon: shapely.Geometry, seen: NDArray[np.bool_], grid: Grid, side: float) -> float:
