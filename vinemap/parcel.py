@@ -284,7 +284,8 @@ def follow(
 
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        record = record_of(recipe, points, layers, seen.chm, origin=origin, n_key_points=seen.n_key_points)
+        about: dict[str, Any] = {"n_key_points": seen.n_key_points, "square": seen.field.square}
+        record = record_of(recipe, points, layers, seen.chm, origin=origin, **about)
         record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {

@@ -81,3 +81,20 @@ def test_curved_rows_on_a_slope():
     assert np.median(error) < 1.0
     assert np.quantile(error, 0.95) < 4
     assert np.median(field.spacing.values[i, j]) == pytest.approx(2.5, rel=0.03)
+
+
+@pytest.mark.parametrize(("along", "length"), [(2.0, 30), (1.6, 20), (2.0, 20)])
+def test_vines_in_a_square_have_rows_in_one_direction(along, length):
+    """Bushes 2 m apart: rows run where they are closer together, or where rows are longer."""
+    x, y = np.meshgrid(np.arange(0, 40, 0.1), np.arange(0, 40, 0.1))
+    wide, high = (length, 20) if along == 2 and length == 30 else (20, 30 if along == 2 else 20)
+    inside = (np.abs(x - 20) < wide / 2) & (np.abs(y - 20) < high / 2)
+    bushes = np.hypot((x - 20 + along / 2) % along - along / 2, (y - 20 + 1.0) % 2.0 - 1.0) < 0.4
+    noise = np.random.default_rng(0).random(x.shape) < 0.9
+    cover = Raster((inside & bushes & noise)[::-1].astype(np.float32), Grid(0.0, 40.0, 0.1, 400, 400), UTM)
+    field = estimate_row_field(cover)
+    assert field.square
+    held = field.likelihood.values > 0.1
+    rows = 0.0 if along < 2 or wide > high else 90.0
+    assert np.quantile(axial(field.direction.values[held], rows), 0.95) < 3
+    assert np.median(field.spacing.values[held]) == pytest.approx(2.0, rel=0.03)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
     from vinemap.product.recipe import Recipe
 
+SQUARE = "vines stand in a square: rows run where vines are closer together, or where rows are longer"
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
 
 
@@ -29,6 +30,7 @@ def record_of(
     *,
     origin: Origin,
     n_key_points: int,
+    square: bool = False,
 ) -> dict[str, Any]:
     """What ``run.json`` tells, but for times and files.
 
@@ -46,6 +48,8 @@ def record_of(
         Of {Main}.
     n_key_points : int
         Key points that were found.
+    square : bool
+        Whether rows could as well run another way.
     """
     sections = layers["sections"]
     modelling = sections[["good", "under", "over", "reduction", "quality"]].mean().round(4)
@@ -65,6 +69,6 @@ def record_of(
         | {name: len(layer) for name, layer in layers.items()},
         "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
         "modelling": modelling.to_dict() if len(sections) else None,
-        "warnings": notices(layers["rows"], chm, layers["parcel"], points.size),
+        "warnings": notices(layers["rows"], chm, layers["parcel"], points.size) + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }

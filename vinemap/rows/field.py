@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.ndimage import distance_transform_edt, map_coordinates, maximum_filter
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    distance_transform_edt,
+    label,
+    map_coordinates,
+    maximum_filter,
+)
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -27,6 +34,12 @@ if TYPE_CHECKING:
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
+AS_GOOD = 0.5
+"""Strength of a second wave over that of the first from which both may be the rows'."""
+EVEN, REGULAR = 0.1, 0.8
+"""Share by which a planting's spacings may differ, and share of the waves that are so regular in each direction."""
+NEAR_WAY, EQUAL = np.radians(12), 1.05
+"""Radians from a block's direction within which a wave has it, and ratio of spacings up to which they are alike."""
 ALIKE, LIKE_SPACING = np.radians(10), 1.15
 """Radians of turn, and ratio of spacings, up to which windows beside each other have the same wave."""
 FAR_STRONGER = 4.0
@@ -65,11 +78,15 @@ def estimate_row_field(
     base = _block_mean(cover, COVER_RESOLUTION)
     band = (min_spacing, max_spacing)
     scan, size = (scan_cylinders, radius) if method == "cylinders" else (scan_spectrum, window)
-    peaks = scan(base.values, size, step, band)
-    peaks = _settled(_axial_median(peaks), least=(window / 2 / step) ** 2)
+    peaks, *others = scan(base.values, size, step, band)
+    least = (window / 2 / step) ** 2
+    square = False
+    for second in others:
+        peaks, square = _one_way(peaks, second, least=least)
+    peaks = _settled(_axial_median(peaks), least=least)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
-    return _resample(peaks, grid, base.grid, stride, cover)
+    return replace(_resample(peaks, grid, base.grid, stride, cover), square=square)
 
 
 def _block_mean(raster: Raster, resolution: float) -> Raster:
@@ -104,6 +121,65 @@ def _axial_median(peaks: Peaks) -> Peaks:
     spacing = np.take_along_axis(spacings, best, 0)[0]
     empty = peaks.strength == 0
     return Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
+
+
+def _one_way(peaks: Peaks, second: Peaks, *, least: float) -> tuple[Peaks, bool]:
+    """Give plantings in a square or a lattice, where two directions are about as good, one for the whole block.
+
+    Tells whether there are any.
+
+    Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
+    """
+    both = (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
+    blocks, n = label(binary_closing(np.pad(both, 2), np.ones((3, 3)))[2:-2, 2:-2])
+    out, square = [values.copy() for values in peaks], False
+    for k in range(1, n + 1):
+        block = blocks == k
+        if np.count_nonzero(block & both) < least:
+            continue
+        waves = [np.concatenate([one[block], other[block]]) for one, other in zip(peaks, second, strict=True)]
+        direction, spacing, strength = (values[waves[2] > 0] for values in waves)
+        one = _most_common(direction, strength)
+        turned = _axial(direction, one) > np.pi / 6
+        if not turned.any():
+            continue
+        two = _most_common(direction[turned], strength[turned])
+        near = [_axial(direction, way) < NEAR_WAY for way in (one, two)]
+        apart = [float(np.median(spacing[some])) for some in near]
+        even = [some & (np.abs(spacing - usual) < EVEN * usual) for some, usual in zip(near, apart, strict=True)]
+        if min(strength[some].sum() for some in even) < REGULAR * strength.sum() / 2:
+            continue  # the block's edge, or gaps, and no second planting
+        square = True
+        i, j = np.nonzero(block)
+        long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in (one, two)]
+        alike = max(apart) < EQUAL * min(apart)
+        chosen = (one, two)[int(np.argmax(long if alike else apart))]
+        around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
+        mine = around & (_axial(peaks.direction, chosen) < NEAR_WAY)
+        other = around & ~mine & (second.strength > 0) & (_axial(second.direction, chosen) < NEAR_WAY)
+        known, wrong = mine | other, around & ~mine & ~other
+        for values, second_values in zip(out, second, strict=True):
+            values[other] = second_values[other]
+        if known.any():
+            a, b = distance_transform_edt(~known, return_distances=False, return_indices=True)
+            for values in out[:2]:
+                values[wrong] = values[a, b][wrong]
+    return Peaks(*out), square
+
+
+def _axial(direction: Values, way: float | Values) -> Values:
+    """Radians between directions and a way, either sense; NaN stays."""
+    out: Values = np.abs(np.angle(np.exp(2j * (direction - way)))) / 2
+    return out
+
+
+def _most_common(direction: Values, weight: Values) -> float:
+    """Direction in radians about which most others lie."""
+    ways = np.radians(np.arange(0, 180, 2))
+    near = np.exp(-0.5 * (_axial(direction[:, None], ways) / NEAR_WAY * 2) ** 2)
+    best = float(ways[int((near * weight[:, None]).sum(axis=0).argmax())])
+    close = _axial(direction, best) < NEAR_WAY
+    return float(np.angle((weight * np.exp(2j * direction))[close].sum()) / 2 % np.pi)
 
 
 def _settled(peaks: Peaks, *, least: float) -> Peaks:
@@ -213,6 +289,7 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
         replace(field.direction, values=np.where(inside, direction[nearest], field.direction.values)),
         replace(field.spacing, values=np.where(known, spacing[nearest], field.spacing.values)),
         field.likelihood,
+        field.square,
     )
 
 

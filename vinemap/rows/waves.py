@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
+SURE = 0.55
+"""Strength from which a window has rows in one direction only."""
 CYLINDER_TURN = 1.0
 """Degrees between the directions in which a cylinder is sliced."""
 COVER_RESOLUTION = 0.25
@@ -43,8 +45,11 @@ class Peaks(NamedTuple):
     strength: Values
 
 
-def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> Peaks:
-    """Strongest wave of the windows centred on a grid of nodes, node (0, 0) at the raster's corner."""
+def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> list[Peaks]:
+    """Strongest waves of the windows centred on a grid of nodes, node (0, 0) at the raster's corner, and the next ones.
+
+    The next are those in another direction, where the strongest don't hold most of a window's variance.
+    """
     windows, occupied, shape = _windows(cover, round(window / COVER_RESOLUTION / 2), step)
     hann = np.hanning(windows.shape[-1] + 1)[:-1]
     taper = (hann[:, None] * hann).astype(np.float32)
@@ -53,7 +58,7 @@ def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, 
     return _peaks(waves, occupied, shape)
 
 
-def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> Peaks:
+def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> list[Peaks]:
     """Direction across which the histogram of the cover in a cylinder varies most, and the period of that histogram.
 
     The thesis scans cylinders so (section 2.3.1); its test, of Comba et al. (2015), is taken as the histogram's
@@ -109,32 +114,48 @@ def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple
     return windows, np.flatnonzero(canopy[::stride, ::stride][:my, :mx]), (my, mx)
 
 
-def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> Peaks:
-    out = np.zeros((3, shape[0] * shape[1]))
-    out[:2] = np.nan
+def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> list[Peaks]:
+    """Waves (3 or 6, k) of batches of windows, in their places."""
+    sets = len(waves[0]) // 3 if waves else 1
+    out = np.zeros((sets, 3, shape[0] * shape[1]))
+    out[:, :2] = np.nan
     if waves:
-        out[:, occupied] = np.concatenate(waves, axis=1)
-    return Peaks(*out.reshape(3, *shape))
+        out[:, :, occupied] = np.concatenate(waves, axis=1).reshape(sets, 3, -1)
+    return [Peaks(*one) for one in out.reshape(sets, 3, *shape)]
 
 
 def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
-    """Direction (rad), spacing (m) and strength (0–1) of windows (k, size, size), as (3, k)."""
+    """Direction (rad), spacing (m) and strength (0–1) of windows (k, size, size), and of the next waves, as (6, k)."""
     size = windows.shape[-1]
     wide = PADDING * size
     mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
     rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2)
     spectrum = fft(rows, n=wide, axis=1)
-    y, x, strength = _strongest(spectrum, COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING)
+    how = COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING
+    first = np.stack(_strongest(spectrum, np.zeros((2, len(spectrum))), *how))
+    second = np.zeros_like(first)
+    second[1] = 1.0
+    weak = np.flatnonzero(first[2] < SURE)
+    if len(weak):
+        second[:, weak] = _strongest(spectrum[weak], first[:2, weak], *how)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
-    direction = np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi)
-    return np.stack([direction, 1 / np.hypot(x, y), strength])
+    waves = [(np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi), 1 / np.hypot(x, y), s) for y, x, s in (first, second)]
+    return np.concatenate(waves)
 
 
 @compiled
 def _strongest(
-    spectrum: NDArray[np.complex64], cell: float, shortest: float, longest: float, harmonics: int, reach: int
+    spectrum: NDArray[np.complex64],
+    other: Values,
+    cell: float,
+    shortest: float,
+    longest: float,
+    harmonics: int,
+    reach: int,
 ) -> tuple[Values, Values, Values]:
     """Frequency of the strongest wave (y and x, cycles a metre) of spectra (k, n, n/2 + 1), and its strength 0–1.
+
+    It lies 30° at the least from another (2, k), if that isn't zero.
 
     The strength is the share of the power beyond long waves that the main lobes (``reach`` bins wide) about the
     wave and its harmonics hold.
@@ -157,7 +178,9 @@ def _strongest(
                 # A real signal's spectrum is symmetric: the half that is kept holds the column j = 0 whole.
                 total += power[row, j] if j else 0.5 * power[row, j]
                 if lowest <= square <= highest and power[row, j] > most and _is_peak(power, i, j):
-                    most, best_i, best_j = power[row, j], i, j
+                    along = i * other[0, k] + j * other[1, k]
+                    if along * along <= 0.75 * square * (other[0, k] ** 2 + other[1, k] ** 2):
+                        most, best_i, best_j = power[row, j], i, j
         if most < 0:  # no peak lies in the band
             y[k], x[k], strength[k] = 0.0, 1 / longest, 0.0
             continue
@@ -217,3 +240,5 @@ class RowField:
     direction: Raster
     spacing: Raster
     likelihood: Raster
+    square: bool = False
+    """Whether somewhere two directions were about as good, as where vines are planted in a square."""
