@@ -157,8 +157,8 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
     clusters = step("Clusters", cluster_rows, key_points, **options["clustering"])
     courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
-    high = settings.cover.high
-    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, high=high, **options["fit"])
+    options["fit"]["high"] = settings.cover.high
+    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
     rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
     rows, gaps = count_missing(judge_rows(rows), gaps, **options["missing"])
     return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
@@ -294,9 +294,8 @@ def follow(
             "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    return Summary(
-        parcel, folder, len(rows), record["length_m"], time.perf_counter() - began, tuple(record["warnings"])
-    )
+    took = time.perf_counter() - began
+    return Summary(parcel, folder, len(rows), record["length_m"], took, tuple(record["warnings"]))
 
 
 def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:
