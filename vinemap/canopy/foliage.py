@@ -44,7 +44,7 @@ def separate_canopy(
     *,
     margin: float = 0.4,
     half_width: float = 0.9,
-    max_height: float = 2.9,
+    max_height: float = 3.6,
     min_neighbours: float = 0.02,
     min_height: float = 0.8,
 ) -> Canopy:

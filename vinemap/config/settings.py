@@ -131,7 +131,7 @@ class CanopyOptions(Options):
 
     margin: float = Field(0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins (m)")
     half_width: Metres = Field(0.9, description="distance from γ at which canopy ends (m)")
-    max_height: Metres = Field(2.9, description="height above terrain at which canopy ends (m)")
+    max_height: Metres = Field(3.6, description="height above terrain at which canopy ends (m)")
     min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
     min_points: int = Field(8, ge=3, description="canopy points of a section")
     min_share: Share = Field(0.15, description="share of the median section's points that a section has")

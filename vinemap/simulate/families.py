@@ -21,6 +21,14 @@ if TYPE_CHECKING:
 
     from vinemap.simulate.terrain import Array, Terrain
 
+
+def _touching(rng: np.random.Generator) -> Survey:
+    """Untrained shoots: canopies that leave a third of the spacing open at their widest, and less at places."""
+    spacing = rng.uniform(1.9, 2.6)
+    vines = {"height": 1.75, "half_width": spacing * rng.uniform(0.31, 0.35), "leafiness": 6.0, "gaps": (2, 3, 4)}
+    return _survey(rng, _block(rng, n=10, spacing=spacing), canopy=vines)
+
+
 LONG_GAPS = {"gaps": (8, 8, 8, 8, 8, 17), "vine_spacing": 0.9}
 BEFORE_FLOWERING = {"height": 1.3, "half_width": 0.15, "leafiness": 4.0}
 
@@ -148,6 +156,9 @@ def _none(rng: np.random.Generator) -> Survey:
     return _survey(rng, [], canopy={"gaps": (), "outline": outline}, density=200.0, weeds=0.4, obstacles=obstacles)
 
 
+CLOSE_PLANTED = {"height": 1.15, "half_width": 0.17, "bottom": 0.35}
+TALL = {"height": 3.1, "half_width": 0.35, "bottom": 0.8}
+PLANTED_THIS_YEAR = {"height": 0.6, "half_width": 0.09, "bottom": 0.1, "leafiness": 20.0, "dead": 0.02, "gaps": (2, 3)}
 FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     "straight": lambda rng: _survey(rng, _block(rng)),
     "curved": lambda rng: _survey(rng, _block(rng, radius=rng.choice([-40, 40]))),
@@ -167,6 +178,11 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     "close": _close,
     "clutter": _clutter,
     "none": _none,
+    "narrow": lambda rng: _survey(rng, _block(rng, n=16, spacing=rng.uniform(0.9, 1.2)), canopy=CLOSE_PLANTED),
+    "broad": lambda rng: _survey(rng, _block(rng, n=6, spacing=rng.uniform(4.5, 6))),
+    "touching": _touching,
+    "tall": lambda rng: _survey(rng, _block(rng, spacing=3), canopy=TALL),
+    "young": lambda rng: _survey(rng, _block(rng), canopy=PLANTED_THIS_YEAR, weeds=0.1, ragged=0.5),
 }
 """Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
 dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""
