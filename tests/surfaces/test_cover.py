@@ -56,3 +56,12 @@ def test_the_level_follows_the_canopies(cloud, vines, spacing, least, most):
     assert least <= found.min() <= np.median(found) <= most
     beside = np.concatenate([sample(cover, xy + [0, spacing / 2]) for xy in at])
     assert np.median(beside) < 0.5 * np.median(np.concatenate([sample(cover, xy) for xy in at]))
+
+
+@pytest.mark.parametrize("resolution", [0.1, 0.3, 0.7, 2.0])
+def test_terrain_of_any_resolution_gives_the_same_level(vineyard, cloud, resolution):
+    points = cloud.above(terrain_model(cloud, resolution=resolution))
+    _, levels = canopy_cover(points, canopy_height_model(points, resolution=resolution))
+    assert levels.body.values.shape == levels.body.grid.shape
+    at = np.concatenate([np.array(line.coords)[:, :2] for line in vineyard.rows.geometry])
+    assert np.median(sample(levels.body, at)) == pytest.approx(0.5)

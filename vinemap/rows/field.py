@@ -124,9 +124,7 @@ def _axial_median(peaks: Peaks) -> Peaks:
 
 
 def _one_way(peaks: Peaks, second: Peaks, *, least: float) -> tuple[Peaks, bool]:
-    """Give plantings in a square or a lattice, where two directions are about as good, one for the whole block.
-
-    Tells whether there are any.
+    """Give plantings in a square, where two directions are about as good, one for the whole block; tell if there are any.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
     """
@@ -205,8 +203,9 @@ def _settled(peaks: Peaks, *, least: float) -> Peaks:
     pairs = pairs[held.ravel()[pairs].all(axis=1)]
     one, other = pairs.T
     direction, spacing = peaks.direction.ravel(), peaks.spacing.ravel()
-    turn = np.abs(np.angle(np.exp(2j * (direction[one] - direction[other])))) / 2
-    alike = (turn < ALIKE) & (np.abs(np.log(spacing[one] / spacing[other])) < np.log(LIKE_SPACING))
+    alike = (_axial(direction[one], direction[other]) < ALIKE) & (
+        np.abs(np.log(spacing[one] / spacing[other])) < np.log(LIKE_SPACING)
+    )
     graph = coo_array((np.ones(alike.sum()), (one[alike], other[alike])), shape=(my * mx, my * mx))
     block = connected_components(graph, directed=False)[1]
     mass, n = np.bincount(block, weights=peaks.strength.ravel()), np.bincount(block, weights=held.ravel())

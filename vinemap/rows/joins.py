@@ -124,9 +124,10 @@ def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: flo
         x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
         beside = (np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)
         standing = np.unique(np.rint(y[beside]).astype(int))
-        open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
         sides = [side[(side >= 1) & (side <= ACROSS)] for side in (standing, -standing)]
-        out[k] = sum(map(len, sides)) > 1 and all((s <= far).all() for s, far in zip(sides, open_to, strict=True))
+        if sum(map(len, sides)) > 1:
+            open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
+            out[k] = all((side <= far).all() for side, far in zip(sides, open_to, strict=True))
     return out
 
 

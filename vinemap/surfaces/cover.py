@@ -113,7 +113,7 @@ def canopy_cover(
 
 def _canopy_height(chm: Raster, high: float) -> Values:
     """Height of the canopies in and beside squares of some metres, in cells of 1 m; 0 where there is nothing."""
-    cells, squares = round(1 / chm.grid.resolution), round(AROUND / chm.grid.resolution)
+    squares = max(1, round(AROUND / chm.grid.resolution))
     ny, nx = (-(-n // squares) for n in chm.grid.shape)
     padded = np.full((ny * squares, nx * squares), np.nan, dtype=np.float32)
     padded[: chm.grid.ny, : chm.grid.nx] = np.where(chm.values <= high, chm.values, np.nan)
@@ -122,9 +122,11 @@ def _canopy_height(chm: Raster, high: float) -> Values:
     n = np.isfinite(ordered).sum(axis=2)
     rank = np.maximum(np.ceil(TOP * n).astype(int) - 1, 0)
     top = np.nan_to_num(np.take_along_axis(ordered, rank[:, :, None], axis=2)[:, :, 0])
-    fine = maximum_filter(top, 3).repeat(squares // cells, axis=0).repeat(squares // cells, axis=1)
-    grid = coarser(chm.grid, resolution=1.0)
-    out: Values = fine[: grid.ny, : grid.nx]
+    x, y = coarser(chm.grid, resolution=1.0).centres()
+    side = squares * chm.grid.resolution
+    i = np.minimum(((chm.grid.north - y) / side).astype(int), ny - 1)
+    j = np.minimum(((x - chm.grid.west) / side).astype(int), nx - 1)
+    out: Values = maximum_filter(top, 3)[np.ix_(i, j)]
     return out
 
 
