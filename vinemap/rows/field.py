@@ -124,7 +124,7 @@ def _axial_median(peaks: Peaks) -> Peaks:
 
 
 def _one_way(peaks: Peaks, second: Peaks, *, least: float) -> tuple[Peaks, bool]:
-    """Give plantings in a square, where two directions are about as good, one for the whole block; tell if there are any.
+    """Give plantings in a square, where two directions are about as good, one a block; tell whether there are any.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
     """
