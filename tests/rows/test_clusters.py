@@ -146,6 +146,17 @@ def test_gaps_of_some_neighbours_that_line_up_are_no_track():
     assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 14)
 
 
+def test_rows_that_touch_where_blocks_abut_are_torn():
+    """Two blocks 15° apart at a track that narrows to nothing; rows that all kink together go on."""
+    turn = np.radians(15)
+    along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    west = [np.array([[-30, 2 * k], [-1.4 * k, 2 * k]]) for k in range(10)]
+    east = [np.array([[0.2, 0.1] + 2 * k * across, [0.2, 0.1] + 2 * k * across + 25 * along]) for k in range(10)]
+    assert_rows_are_kept_apart(cluster_rows(key_points([*west, *east], spacing=2)), 20)
+    kinked = [np.array([[-30, 2 * k], [0, 2 * k], [0, 2 * k] + 25 * along]) for k in range(10)]
+    assert_rows_are_kept_apart(cluster_rows(key_points(kinked, spacing=2)), 10)
+
+
 def test_straight_rows_are_not_joined_by_a_bend():
     """Two rows of blocks of their own directions, in line with each other's ends; rows on an arc of the same turn."""
     turn = np.radians(24)

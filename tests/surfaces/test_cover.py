@@ -58,6 +58,17 @@ def test_the_level_follows_the_canopies(cloud, vines, spacing, least, most):
     assert np.median(beside) < 0.5 * np.median(np.concatenate([sample(cover, xy) for xy in at]))
 
 
+def test_huts_do_not_raise_the_level(cloud):
+    """Flat roofs as high as the vines beside them are no rows that touch."""
+    rows = rows_of(4, length=25)
+    huts = [Obstacle(*(rows[3].mean(axis=0) + [x, 7]), 2.2, 1.5, 2.0, solid=True) for x in (-7, 0, 7)]
+    survey = simulate([Vineyard("A", rows)], hillside(0.05), obstacles=huts, density=300, seed=3)
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    _, levels = canopy_cover(points, canopy_height_model(points))
+    assert np.array_equal(levels.ridge.values, levels.body.values)
+
+
 @pytest.mark.parametrize("resolution", [0.1, 0.3, 0.7, 2.0])
 def test_terrain_of_any_resolution_gives_the_same_level(vineyard, cloud, resolution):
     points = cloud.above(terrain_model(cloud, resolution=resolution))

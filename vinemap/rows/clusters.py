@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.rows.joins import candidates, ends_of, join, over_track_or_headland
+from vinemap.rows.joins import candidates, ends_of, join, over_track_or_headland, torn
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -29,7 +29,7 @@ def cluster_rows(
     *,
     method: str = "pieces",
     along: float = 1.0,
-    across: float = 0.12,
+    across: float = 0.2,
     min_points: int = 6,
     max_gap: float = 20.0,
     track_width: float = 3.5,
@@ -72,6 +72,7 @@ def cluster_rows(
     if thesis:
         return out.assign(cluster=pieces)
     position = _position_along(np.flatnonzero(kept), pieces, graph)
+    pieces, position = torn(xy[kept], spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
     pairs = candidates(ends, max_gap)
     pairs = pairs[~over_track_or_headland(ends, pairs, xy[kept], track_width)]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import label
+from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ BEND_LENGTH = 10.0
 KINK = 0.16
 """Radians that a gap may turn a row beyond what the pieces on both sides do."""
 THEREABOUTS, SEVERAL = 25.0, 5
-"""Metres within which other pieces, and so many of them, tell how a piece bends that is too short for it."""
+"""Metres within which pieces, and so many of them, tell how rows bend."""
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 FLANK = 4.0
@@ -29,6 +30,8 @@ OPEN = 0.62
 """Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
 STRIDE = 0.5
 """Metres between the places at which ground is looked at."""
+BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
+"""Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 MARGIN = 0.5
 """Spacings by which a row must be crossed."""
 OVERLAP = 0.5
@@ -46,6 +49,31 @@ class Ends(NamedTuple):
     spacing: Values
     bend: Values
     """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
+
+
+def torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
+    """Pieces (n,) of key points (n, 2) and their places along them, torn at kinks where more rows end than go on.
+
+    There two blocks abut, at a track that narrows to nothing, and rows of both touch.
+    """
+    pieces, position = pieces.copy(), position.copy()
+    order = np.argsort(pieces, kind="stable")
+    first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
+    tree = None
+    for p in np.flatnonzero(np.diff(first)):
+        members = order[first[p] : first[p + 1]]
+        for s in reversed(_kinks(xy[members], position[members])):
+            tree = tree or cKDTree(xy)
+            middle, before, after = (
+                xy[members[np.abs(position[members] - at).argmin()]]
+                for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
+            )
+            if _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
+                beyond = members[position[members] > s]
+                pieces[beyond] = pieces.max() + 1
+                position[beyond] -= position[beyond].min()
+                members = members[position[members] <= s]
+    return pieces, position
 
 
 def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, position: Values) -> Ends:
@@ -149,32 +177,69 @@ def _like(axis: Values, way: Values) -> Values:
 
 
 def _kinked(ends: Ends, a: Ints, b: Ints, length: Values) -> Flags:
-    """Whether two ends (k,) could only be joined by a bend that neither of their pieces, where long enough, has."""
-    (ax, ay), (bx, by) = ends.tangent[a].T, -ends.tangent[b].T
-    turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+    """Whether two ends (k,) could only be joined by a bend that rows thereabouts don't have."""
     own = _bends(ends)
     bends = np.stack([own[a], -own[b]])
     known = np.isfinite(bends)
     bend = np.where(known, bends, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    # Tangents are those of the middle of the pieces' last metres.
-    out: Flags = known.any(axis=0) & (np.abs(turn - bend * (length + TANGENT_LENGTH)) > KINK)
+
+    def kink(way: Values) -> Values:
+        (ax, ay), (bx, by) = way[a].T, -way[b].T
+        turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+        # Tangents are those of the middle of the pieces' last metres.
+        out: Values = np.abs(turn - bend * (length + TANGENT_LENGTH))
+        return out
+
+    out: Flags = known.any(axis=0) & (np.maximum(kink(ends.tangent), kink(ends.field)) > KINK)
     return out
 
 
 def _bends(ends: Ends) -> Values:
-    """Curvature (2 m,) at every end, of pieces that are too short to tell that of the others thereabouts."""
+    """Curvature (2 m,) at every end: the median of what the pieces thereabouts have, or its own where there are few."""
     known = np.flatnonzero(np.isfinite(ends.bend))
-    unknown = np.flatnonzero(~np.isfinite(ends.bend))
     out = ends.bend.copy()
-    if len(known) < SEVERAL or len(unknown) == 0:
+    if len(known) < SEVERAL:
         return out
-    distance, nearest = cKDTree(ends.xy[known]).query(ends.xy[unknown], SEVERAL, distance_upper_bound=THEREABOUTS)
+    distance, nearest = cKDTree(ends.xy[known]).query(ends.xy, SEVERAL, distance_upper_bound=THEREABOUTS)
     near = known[np.minimum(nearest, len(known) - 1)]
     # The same bend is to the left on the way out of one end, and to the right out of the other.
-    sense = np.sign((ends.tangent[near] * ends.tangent[unknown][:, None]).sum(axis=2))
+    sense = np.sign((ends.tangent[near] * ends.tangent[:, None]).sum(axis=2))
     told = np.isfinite(distance).all(axis=1)
-    out[unknown[told]] = np.median(sense * ends.bend[near], axis=1)[told]
+    out[told] = np.median(sense * ends.bend[near], axis=1)[told]
     return out
+
+
+def _kinks(xy: Values, position: Values) -> Values:
+    """Metres along a piece (n, 2) at which it turns more than it bends before and after."""
+    k, least = round(TANGENT_LENGTH / STRIDE), round(SHORT / STRIDE)
+    order = np.argsort(position)
+    along = np.arange(0, position[order[-1]], STRIDE)
+    if len(along) <= 2 * least:
+        return np.empty(0)
+    curve = np.column_stack([np.interp(along, position[order], xy[order, axis]) for axis in (0, 1)])
+    here = np.arange(least, len(along) - least)
+    before, after = (
+        curve[here] - curve[np.maximum(here - k, 0)],
+        curve[np.minimum(here + k, len(along) - 1)] - curve[here],
+    )
+    turn = np.zeros(len(along))
+    turn[here] = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
+    padded = np.pad(turn, k)
+    sides = np.stack([padded[: -2 * k], padded[2 * k :]])
+    bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
+    # Beside a kink it is a bend, and what is straight there no kink.
+    kink = np.minimum(np.abs(turn), np.abs(turn - bend))
+    out: Values = along[find_peaks(kink, KINK, distance=2 * k)[0]]
+    return out
+
+
+def _end_beside(tree: cKDTree, pieces: Ints, middle: Values, along: Values, spacing: float) -> bool:
+    """Whether more of the rows beside a kink end there than go on through it."""
+    near = np.array(tree.query_ball_point(middle, np.hypot(STRETCH, BESIDE * spacing)))
+    x = (tree.data[near] - middle) @ along / np.hypot(*along)
+    before, after = (set(pieces[near[(way * x >= ASLANT) & (way * x <= STRETCH)]]) for way in (-1, 1))
+    # The row itself goes on; a row that ends here and another that begins count as one.
+    return len(before ^ after) > 2 * (len(before & after) - 1)
 
 
 def _open_across(

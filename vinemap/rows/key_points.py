@@ -130,11 +130,11 @@ def _smoothed(profile: Values, offsets: Values, spacing: Values, smoothing: floa
     """Profiles (n, bins) smoothed by a Gaussian, the wider the wider the canopy in them: a broad top has one middle."""
     step = offsets[1] - offsets[0]
     inside = np.abs(offsets) <= 0.5 * spacing[:, None]
-    highest = np.maximum((profile * inside).max(axis=1), 1e-9)
+    out: Values = gaussian_filter1d(profile, smoothing / step, axis=1)
+    highest = np.maximum((out * inside).max(axis=1), 1e-9)
     width = (profile * inside).sum(axis=1) * step / highest
     wanted = np.digitize(WIDTH_SHARE * width / smoothing, [(a + b) / 2 for a, b in pairwise(WIDE)])
-    out = np.empty_like(profile)
-    for k, factor in enumerate(WIDE):
+    for k, factor in enumerate(WIDE[1:], start=1):
         mine = wanted == k
         out[mine] = gaussian_filter1d(profile[mine], factor * smoothing / step, axis=1)
     return out

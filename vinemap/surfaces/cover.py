@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Grid
 
     Counts = NDArray[np.uint16]
@@ -37,6 +36,8 @@ ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
 AROUND = 4.0
 """Metres, about: side of the squares in which the canopies' height is told, from theirs and from those beside them."""
+ABOUT = 6.0
+"""Metres about rows that touch in which they are told by where they stand apart."""
 TOP = 0.97
 """Order of a square's heights that is its canopies'."""
 FOOT, LEAST = 0.4, 0.2
@@ -94,21 +95,23 @@ def canopy_cover(
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
     top = _canopy_height(chm, high)
-    foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low)
-    body = level = Raster(foot.astype(np.float32), coarser(chm.grid, resolution=1.0), cloud.crs)
-    counts = _counts(cloud, grid, level, high)
-    wide = _closed(counts, resolution, TOUCHING)
-    if wide.any():
-        ridge = np.where(_in_cells_of(level.grid, wide, grid, resolution), np.maximum(RIDGE * top, foot), foot)
-        level = replace(level, values=ridge.astype(np.float32))
-        counts = _counts(cloud, grid, level, high)
-    everything, canopy, _ = counts
+    foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
+    ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
+    metres = coarser(chm.grid, resolution=1.0)
+    everything, body, crown, above = _counts(cloud, grid, metres, (foot, ridge), high)
+    touching = _closed(everything, body + above, resolution, TOUCHING)
+    if touching.any():
+        wide = _closed(everything, crown + above, resolution, WIDEST)
+        touching &= ~binary_dilation(wide, _disc(WIDEST, _side(resolution)))
+    apart = _about(touching, grid, metres, resolution)
+    levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
+    canopy = np.where(apart.ravel()[_cells_of(metres, grid)], crown, body) if apart.any() else body
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
     cover /= blurred + np.float32(0.1 * density)
-    cover[_no_vines(counts, resolution)] = 0.0
-    return Raster(cover, grid, cloud.crs), Levels(body, level)
+    cover[_no_vines(everything, canopy, above, resolution)] = 0.0
+    return Raster(cover, grid, cloud.crs), levels
 
 
 def _canopy_height(chm: Raster, high: float) -> Values:
@@ -130,26 +133,34 @@ def _canopy_height(chm: Raster, high: float) -> Values:
     return out
 
 
-def _in_cells_of(grid: Grid, mask: Flags, fine: Grid, resolution: float) -> Flags:
-    """Cells of a grid that have some of a mask (of blocks of a fine grid's cells) in them or beside them."""
-    k = max(1, round(BLOCK / resolution))
-    i, j = np.nonzero(mask)
-    x, y = fine.west + (j + 0.5) * k * resolution, fine.north - (i + 0.5) * k * resolution
-    out = np.zeros(grid.ny * grid.nx, dtype=bool)
-    out[cell_of(np.column_stack([x, y]), grid)] = True
-    held: Flags = binary_dilation(out.reshape(grid.shape), np.ones((3, 3)))
-    return held
+def _about(blocks: Flags, grid: Grid, metres: Grid, resolution: float) -> Flags:
+    """Cells of 1 m that have some of a mask (of blocks of a grid's cells) in them or thereabouts."""
+    i, j = np.nonzero(blocks)
+    x, y = grid.west + (j + 0.5) * _side(resolution), grid.north - (i + 0.5) * _side(resolution)
+    out = np.zeros(metres.ny * metres.nx, dtype=bool)
+    out[cell_of(np.column_stack([x, y]), metres)] = True
+    around: Flags = binary_dilation(out.reshape(metres.shape), _disc(ABOUT, metres.resolution))
+    return around
 
 
-def _counts(cloud: Cloud, grid: Grid, level: Raster, high: float) -> Counts:
-    """Points (3, ny, nx) in cells: all, those of the canopies' heights, and those above."""
-    counts = np.zeros((3, grid.ny * grid.nx), dtype=np.uint16)
+def _cells_of(coarse: Grid, fine: Grid) -> Ints:
+    """Index (ny, nx) of the coarse cell in which each fine one lies."""
+    x, y = fine.centres()
+    i = np.clip(((coarse.north - y) / coarse.resolution).astype(int), 0, coarse.ny - 1)
+    j = np.clip(((x - coarse.west) / coarse.resolution).astype(int), 0, coarse.nx - 1)
+    out: Ints = i[:, None] * coarse.nx + j
+    return out
+
+
+def _counts(cloud: Cloud, grid: Grid, metres: Grid, levels: tuple[Values, Values], high: float) -> Counts:
+    """Points (4, ny, nx) in cells: all, those from each of two levels to a height, and those above."""
+    counts = np.zeros((4, grid.ny * grid.nx), dtype=np.uint16)
     for part in cloud.parts():
         for start in range(0, part.size, BATCH):
             batch = slice(start, start + BATCH)
             xyz, heights = part.xyz[batch], part.heights[batch]
-            _count(cell_of(xyz, grid), xyz, heights, level.values, level.grid, (high, TALLEST), counts)
-    return counts.reshape(3, *grid.shape)
+            _count(cell_of(xyz, grid), xyz, heights, levels, metres, (high, TALLEST), counts)
+    return counts.reshape(4, *grid.shape)
 
 
 @compiled
@@ -157,51 +168,55 @@ def _count(
     cells: NDArray[np.int32],
     xyz: Values,
     heights: Values,
-    level: Values,
-    levels: Grid,
+    levels: tuple[Values, Values],
+    metres: Grid,
     limits: tuple[float, float],
     counts: NDArray[np.uint16],
 ) -> None:
-    """Count points in cells (3, n): all, those between the level there and a height, those from that to the highest."""
+    """Count points in cells (4, n): all, those from either level there to a height, those from it to a highest."""
+    lower, upper = levels
     high, highest = limits
     for p in range(len(cells)):
         cell = cells[p]
         if counts[0, cell] == MOST:
             continue
         counts[0, cell] += 1
-        i, j = nearest_cell(levels, xyz[p, 0], xyz[p, 1])
-        if level[i, j] <= heights[p] <= high:
+        i, j = nearest_cell(metres, xyz[p, 0], xyz[p, 1])
+        if lower[i, j] <= heights[p] <= high:
             counts[1, cell] += 1
+            if heights[p] >= upper[i, j]:
+                counts[2, cell] += 1
         elif high < heights[p] < highest:
-            counts[2, cell] += 1
+            counts[3, cell] += 1
 
 
-def _closed(counts: Counts, resolution: float, width: float) -> Flags:
+def _closed(everything: Counts, high: Counts, resolution: float, width: float) -> Flags:
     """Blocks of cells over which canopy is closed across some metres."""
     k = max(1, round(BLOCK / resolution))
-    everything, low, above = (block_sum(layer, k) for layer in counts)
-    if np.median(everything[everything > 0]) < ENOUGH:
-        everything, low, above = _summed(counts, resolution)
-        closed = low + above > 0.5 * np.maximum(everything, 1)
+    total, above = block_sum(everything, k), block_sum(high, k)
+    if np.median(total[total > 0]) < ENOUGH:
+        closed = _summed(high, resolution) > 0.5 * np.maximum(_summed(everything, resolution), 1)
     else:
-        closed = uniform_filter((low + above > 0.5 * np.maximum(everything, 1)).astype(np.float32), 3) > 0.5
+        closed = uniform_filter((above > 0.5 * np.maximum(total, 1)).astype(np.float32), 3) > 0.5
     out: Flags = binary_opening(closed, _disc(width / 2, _side(resolution)))
     return out
 
 
-def _no_vines(counts: Counts, resolution: float) -> Flags:
+def _no_vines(everything: Counts, canopy: Counts, above: Counts, resolution: float) -> Flags:
     """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them."""
     k = max(1, round(BLOCK / resolution))
-    all_, _, above = _summed(counts, resolution)
-    high = binary_opening((above > 2.5) & (above > 0.15 * all_), np.ones((3, 3)))
-    out: Flags = binary_dilation(high | _closed(counts, resolution, WIDEST), _disc(0.5, _side(resolution)))
-    return out.repeat(k, axis=0).repeat(k, axis=1)[: counts.shape[1], : counts.shape[2]]
+    total, tall = _summed(everything, resolution), _summed(above, resolution)
+    high = binary_opening((tall > 2.5) & (tall > 0.15 * total), np.ones((3, 3)))
+    wide = _closed(everything, canopy + above, resolution, WIDEST)
+    out: Flags = binary_dilation(high | wide, _disc(0.5, _side(resolution)))
+    return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
 
 
-def _summed(counts: Counts, resolution: float) -> list[NDArray[np.float64]]:
+def _summed(layer: Counts, resolution: float) -> Values:
     """Counts over 3 x 3 blocks of cells, so that a sparse cloud is judged by more than a point or two."""
     k = max(1, round(BLOCK / resolution))
-    return [9 * uniform_filter(block_sum(layer, k), 3) for layer in counts]
+    out: Values = 9 * uniform_filter(block_sum(layer, k), 3)
+    return out
 
 
 def _side(resolution: float) -> float:
