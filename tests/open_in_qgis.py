@@ -51,6 +51,8 @@ def told(layer):
         {"low": r.lowerValue(), "high": r.upperValue(), "label": r.label(), "colour": r.symbol().color().name()}
         for r in (renderer.ranges() if renderer.type() == "graduatedSymbol" else [])
     ]
+    if renderer.type() == "categorizedSymbol":
+        classes = [{"label": c.label(), "colour": c.symbol().color().name()} for c in renderer.categories()]
     return about | {
         "kind": "vector",
         "n": layer.featureCount(),

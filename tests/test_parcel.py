@@ -1,6 +1,7 @@
 """The whole chain on small vineyards: products, their contract, and what is left when something is wrong."""
 
 import json
+import re
 
 import geopandas as gpd
 import numpy as np
@@ -143,21 +144,35 @@ def test_meshes_are_closed_named_and_in_place(product):
     assert node.extras["length_m"] == pytest.approx(rows.set_index("row_id")["length_m"][3])
 
 
-def test_nothing_is_a_product_of_empty_layers(tmp_path):
+def test_where_a_tree_stands_alone_a_product_has_no_rows(tmp_path):
     bare = Vineyard("bare", rows_of(4, length=20), leafiness=0.0)
     x, y = bare.rows[0].mean(axis=0) + [0, 4]
     survey = simulate([bare], hillside(0.1), obstacles=[Obstacle(x, y, 2, 2, 5, 1)], seed=1, name="meadow", density=100)
     summary = map_parcel(write_survey(survey, tmp_path / "in"), tmp_path / "out", parcel="meadow")
     assert summary.rows == 0
     assert "no vine row found" in summary.line()
+    assert "too tall for vines" in summary.line()
     for layer, contract in LAYERS.items():
         frame = gpd.read_file(paths.geopackage(tmp_path / "out", "meadow"), layer=layer)
         assert [c for c in frame.columns if c != "geometry"] == list(contract.columns)
-        assert len(frame) == (1 if layer == "parcel" else 0)
+        assert len(frame) == (1 if layer in ("parcel", "unmapped") else 0)
     for kind in RASTERS:
         assert paths.raster(tmp_path / "out", "meadow", kind).is_file()
     assert len(pygltflib.GLTF2().load(paths.canopy_mesh(tmp_path / "out", "meadow")).nodes) == 1
     assert not paths.tileset(tmp_path / "out").exists()
+    tree = gpd.read_file(paths.geopackage(tmp_path / "out", "meadow"), layer="unmapped").iloc[0]
+    assert tree["reason"] == "too tall"
+    assert tree["height_m"] == pytest.approx(5, abs=0.7)
+    assert tree["area_m2"] == pytest.approx(4 * np.pi, rel=0.4)
+    assert shapely.distance(tree.geometry, shapely.Point(x, y)) == 0
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["unmapped_m2"] == {"too tall": pytest.approx(tree["area_m2"], abs=0.05)}
+    item = json.loads(paths.stac_item(tmp_path / "out", "meadow").read_text())
+    assert item["properties"]["vinemap:unmapped_m2"] == 0, "no vines"
+    page = paths.report(tmp_path / "out", "meadow").read_text(encoding="utf-8")
+    (drawn,) = re.findall(r'"unmapped":(\{"reason":\["too tall"\].*?\})', page)
+    (ring,) = json.loads(drawn)["outline"][0]
+    assert len(ring) == len(shapely.get_coordinates(tree.geometry))
 
 
 def test_a_fault_in_the_page_costs_no_product(tmp_path, survey, product, monkeypatch):

@@ -146,10 +146,22 @@ def test_all_rows_and_no_other(product, shared, name, n):
     assert abs(found.pairs[["e1_along_m", "en_along_m"]].to_numpy().mean()) <= 0.03
 
 
+@pytest.mark.parametrize("name", ["parcelF", "twoblocks", "riseholme"])
+def test_of_trees_and_a_hut_beside_the_rows_none_is_taken_for_vines(product, name):
+    folder = product(name)
+    unmapped = gpd.read_file(paths.geopackage(folder, name), layer="unmapped")
+    assert set(unmapped["reason"]) <= {"too tall", "too wide"}
+    assert json.loads((folder / "run.json").read_text())["warnings"] == []
+
+
 def test_no_vines_no_rows(product):
     folder = product("nothing")
     assert len(rows_of(folder, "nothing")) == 0
-    assert json.loads((folder / "run.json").read_text())["counts"]["rows"] == 0
+    record = json.loads((folder / "run.json").read_text())
+    assert record["counts"]["rows"] == 0
+    (warning,) = record["warnings"]
+    assert warning.startswith("no row was found in what stands on ")
+    assert "too tall for vines" in warning
 
 
 def test_terrain(product, shared):

@@ -24,6 +24,7 @@ from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.config.names import check_name
 from vinemap.config.settings import Settings
+from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.geo.crs import check_near, corner_of
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
@@ -78,6 +79,7 @@ STAGES = (
     "Sections",
     "Canopy",
     "Mesh",
+    "Unmapped",
     "Writing",
 )
 
@@ -233,12 +235,7 @@ def follow(
     drafts, within : Path, optional
         As for :func:`vinemap.product.store.product`.
     step : callable
-        As for :func:`map_parcel`.
-
-    Raises
-    ------
-    VinemapError
-        If the input can't be used or the product can't be written.
+        As for :func:`map_parcel`; the same errors are raised.
     """
     parcel, settings, origin = recipe.parcel, recipe.settings, recipe.origin
     check_engine(settings.ground.engine)
@@ -266,13 +263,16 @@ def follow(
             threshold=settings.curves.threshold,
         )
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=settings.sections.step)
+        outlines = parcel_layer(parcel, rows, recipe.boundary, points)
+        within = outlines if recipe.boundary else None
         layers = {
             "rows": rows,
             "row_ends": ends,
             "key_points": enhanced,
             "sections": labelled(model.table, rows),
             "gaps": labelled(gaps, rows),
-            "parcel": parcel_layer(parcel, rows, recipe.boundary, points),
+            "unmapped": run("Unmapped", find_unmapped, seen.chm, rows, within, tallest=settings.cover.high),
+            "parcel": outlines,
         }
 
         def write() -> None:

@@ -75,12 +75,14 @@ def project(open_in_qgis, product):
 
 
 def test_the_bare_geopackage_is_styled(layers):
-    assert set(layers) == {"rows", "row_ends", "key_points", "sections", "gaps", "parcel"}
+    assert set(layers) == {"rows", "row_ends", "key_points", "sections", "gaps", "unmapped", "parcel"}
     assert all(layer["valid"] and layer["styled"] and layer["crs"] for layer in layers.values())
     assert layers["rows"]["labels"]
     assert layers["rows"]["renderer"] == layers["sections"]["renderer"] == "graduatedSymbol"
     assert all("m³/m" in c["label"] for c in layers["rows"]["classes"])
     assert layers["gaps"]["colour"] == "#d7263d"
+    assert layers["unmapped"]["renderer"] == "categorizedSymbol"
+    assert layers["unmapped"]["classes"][-1] == {"label": "too tall", "colour": "#566a8c"}
     assert layers["sections"]["scale"] == 800
 
 
@@ -89,13 +91,14 @@ def test_the_bare_geopackage_explains_itself(layers):
     assert layers["rows"]["aliases"]["volume_m3"] == "Volume (m³)"
     assert layers["parcel"]["aliases"]["area_m2"] == "Area (m²)"
     assert "missing vines" in layers["rows"]["tip"]
+    assert "reason" in layers["unmapped"]["tip"]
 
 
 def test_the_project_opens_at_the_parcel_with_everything_valid(project):
     assert project["read"]
     assert project["title"] == "Clos & Fils #3"
     assert project["crs"] == "EPSG:32632"
-    assert len(project["layers"]) == 12
+    assert len(project["layers"]) == 13
     assert all(layer["valid"] and layer["crs"] for layer in project["layers"])
     assert project["errors"] == []
     assert project["colours"] > 200

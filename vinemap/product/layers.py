@@ -57,6 +57,11 @@ LAYERS: dict[str, Layer] = {
         _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE},
         "Stretches of rows without canopy",
     ),
+    "unmapped": Layer(
+        "MultiPolygon",
+        {"reason": TEXT} | dict.fromkeys(("area_m2", "share", "height_m", "width_m"), REAL),
+        "What stands as high as vines, or higher, in no row, and why",
+    ),
     "parcel": Layer(
         "MultiPolygon",
         {"parcel": TEXT, "n_rows": WHOLE}

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.ndimage import binary_opening
-from scipy.spatial import cKDTree
 
+from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.geo.raster import block_sum
 
 if TYPE_CHECKING:
@@ -25,29 +24,30 @@ DENSE = 60.0
 """Points a square metre below which canopies come out poorly."""
 SURE = 0.5
 """Confidence of a row that is worth a look."""
-LOWEST, HIGHEST = 0.45, 3.6
-"""Metres of height from which what stands there is no grass, and up to which it may be vines."""
-HALF = 0.5
-"""Share of the rows' height below which what stands between them is no vine; and of a square that plants fill."""
-STEP = 0.5
-"""Metres between the points of rows."""
-ROOF = 3.0
-"""Metres across which plants are closed that are no rows."""
+FEW = 5.0
+"""Points a square metre below which vines may not be seen."""
 MOST_LEFT = 0.02
-"""Share of a parcel on which vines may stand that are in no row."""
+"""Share of a parcel on which something may stand that is in no row and might be vines."""
+MAIN = 0.1
+"""Share of what is in no row from which a reason is worth to be told."""
 
 
-def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_points: int) -> list[str]:
-    """Remarks, a sentence each: how far points cover a parcel, how densely, doubtful rows, and plants in no row.
+def notices(
+    rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, unmapped: gpd.GeoDataFrame, n_points: int
+) -> list[str]:
+    """Remarks, a sentence each: how far points cover a parcel, how densely, doubtful rows, and what is in no row.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineString with ``confidence``, ``spacing_m`` and ``height_m``.
+        LineString with ``confidence``.
     chm : Raster
         Canopy height, NaN where there are no points.
     parcel : GeoDataFrame
         Polygons of the parcel.
+    unmapped : GeoDataFrame
+        As of :func:`vinemap.evaluate.unmapped.find_unmapped`. What is too tall is no vine and is told only where it may
+        be why no row was found.
     n_points : int
         Number of points.
     """
@@ -63,39 +63,46 @@ def notices(rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, n_poi
         f"{density:.0f} points/m², canopies are poor below {DENSE:.0f}": density < DENSE,
         f"{doubtful} of {len(rows)} rows are doubtful (confidence below {SURE:g})": doubtful > 0,
     }
-    return [remark for remark, holds in remarks.items() if holds] + _plants_in_no_row(rows, chm, polygon)
+    told = [remark for remark, holds in remarks.items() if holds]
+    return told + (_in_no_row(unmapped) if len(rows) else [_why_nothing(unmapped, density)])
 
 
-def _plants_in_no_row(rows: gpd.GeoDataFrame, chm: Raster, polygon: shapely.Geometry) -> list[str]:
-    """What stands at the height of vines in a parcel, and in none of its rows."""
-    grid = chm.grid
-    heights = rows["height_m"].dropna()
-    low = max(LOWEST, HALF * float(heights.median())) if len(heights) else LOWEST
-    plants = (chm.values >= low) & (chm.values <= HIGHEST)
-    i, j = np.nonzero(plants)
-    x, y = grid.west + (j + 0.5) * grid.resolution, grid.north - (i + 0.5) * grid.resolution
-    left = shapely.contains_xy(polygon, x, y)
-    if len(rows):
-        lines = shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP)
-        points, row = shapely.get_coordinates(lines, return_index=True)
-        half = 0.5 * rows["spacing_m"].to_numpy()[row]
-        distance, nearest = cKDTree(points).query(
-            np.column_stack([x, y]), distance_upper_bound=float(half.max()) + STEP, workers=-1
-        )
-        left &= ~(distance <= half[np.minimum(nearest, len(half) - 1)])
-    plants[i, j] = left
-    n = max(1, round(1 / grid.resolution))
-    squares = block_sum(plants.astype(np.uint16), n) >= HALF * n**2
-    area = float(np.count_nonzero(squares)) * (n * grid.resolution) ** 2
-    share = area / max(float(shapely.area(polygon)), 1.0)
-    if share <= MOST_LEFT:
+def _in_no_row(unmapped: gpd.GeoDataFrame) -> list[str]:
+    """What stands in a parcel and in none of its rows, where it is much and may be vines."""
+    vines = unmapped[unmapped["reason"] != TALL]
+    if vines["share"].sum() <= MOST_LEFT:
         return []
-    side = max(1, round(ROOF / (n * grid.resolution)))
-    roof = np.count_nonzero(binary_opening(squares, np.ones((side, side)))) > HALF * np.count_nonzero(squares)
-    why = f"closed over {ROOF:g} m and more, so that no rows can be told" if roof else "no rows were seen in them"
-    return [
-        f"plants of {low:.1f} to {HIGHEST:g} m stand in no row on {area:,.0f} m² ({share:.0%} of the parcel): {why}"
-    ]
+    return [f"what stands on {_size(vines)} is in no row: {_reasons(vines)}"]
+
+
+def _why_nothing(unmapped: gpd.GeoDataFrame, density: float) -> str:
+    """Why no row was found."""
+    if len(unmapped):
+        return f"no row was found in what stands on {_size(unmapped)}: {_reasons(unmapped)}"
+    few = f", or too few points show it ({density:.1f} a m²)" if density < FEW else ""
+    return f"no row was found: nothing stands there that is as high as vines{few}"
+
+
+def _size(unmapped: gpd.GeoDataFrame) -> str:
+    return f"{unmapped['area_m2'].sum():,.0f} m² ({unmapped['share'].sum():.0%} of the parcel)"
+
+
+def _reasons(unmapped: gpd.GeoDataFrame) -> str:
+    """Why something is in no row, in words, the main reasons first."""
+    areas = unmapped.groupby("reason")["area_m2"].sum().sort_values(ascending=False)
+    most = unmapped.groupby("reason")[["height_m", "width_m"]].max()
+    words = {
+        TALL: "too tall for vines (up to {height_m:.0f} m)",
+        WIDE: "closed over {width_m:.0f} m, so that no rows can be told",
+        LOW: "lower than half of the rows ({height_m:.1f} m)",
+        UNSEEN: "like vines, but no rows were seen",
+        ALONE: "alone",
+    }
+    main = areas[areas >= MAIN * areas.sum()]
+    told = [words[reason].format(**most.loc[reason]) for reason in main.index]
+    if len(told) > 1:
+        told = [f"{area:,.0f} m² {one}" for one, area in zip(told, main, strict=True)]
+    return "; ".join(told)
 
 
 def _covered(polygon: shapely.Geometry, seen: NDArray[np.bool_], grid: Grid, side: float) -> float:

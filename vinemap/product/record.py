@@ -68,7 +68,8 @@ def record_of(
         "counts": {"points": points.size, "key_points_found": n_key_points}
         | {name: len(layer) for name, layer in layers.items()},
         "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
+        "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
-        "warnings": notices(layers["rows"], chm, layers["parcel"], points.size) + [SQUARE] * square,
+        "warnings": notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size) + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }

@@ -23,6 +23,7 @@ from pystac.extensions.file import FileExtension
 from pystac.extensions.projection import ProjectionExtension
 
 from vinemap import __version__, paths
+from vinemap.evaluate.unmapped import TALL
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.store import write_whole
 
@@ -279,6 +280,7 @@ def write_item(folder: Path, recipe: Recipe, record: dict[str, Any], polygons: g
         "points": record["counts"]["points"],
         "rows": record["counts"]["rows"],
         "rows_length_m": record["length_m"],
+        "unmapped_m2": round(sum(area for reason, area in record["unmapped_m2"].items() if reason != TALL), 1),
         "area_m2": round(float(polygons.area.sum()), 1),
     }
     where: dict[str, Any] = {"polygon": polygons.union_all(), "crs": polygons.crs, "survey": recipe.survey}

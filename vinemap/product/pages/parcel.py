@@ -51,6 +51,8 @@ TABLE = {
     **dict.fromkeys(("trv_m3_ha", "lwa_m2_ha"), 0),
 }
 """Columns of ``rows`` on the page, and their decimals."""
+UNMAPPED = {"area_m2": 1, "share": 4, "height_m": 1, "width_m": 1}
+"""Columns of ``unmapped`` on the page, and their decimals."""
 RECORD = (
     "vinemap",
     "survey",
@@ -85,7 +87,7 @@ def parcel_page(
     canopies : bytes
         The meshes, as binary glTF.
     """
-    rows, gaps, parcel = layers["rows"], layers["gaps"], layers["parcel"]
+    rows, gaps, unmapped, parcel = (layers[name] for name in ("rows", "gaps", "unmapped", "parcel"))
     grid = chm.grid
     zero = np.array([grid.west, grid.north - grid.ny * grid.resolution])
     picture, across, down = canopy_picture(chm)
@@ -101,6 +103,11 @@ def parcel_page(
             "line": polylines(rows.geometry, zero, tolerance=TOLERANCE),
         },
         "gaps": {name: np.round(gaps[name], 2).to_numpy() for name in ("row_id", "start_m", "end_m", "n_missing")},
+        "unmapped": {
+            "reason": unmapped["reason"].tolist(),
+            **{name: np.round(unmapped[name].to_numpy(), digits) for name, digits in UNMAPPED.items()},
+            "outline": [rings(polygon, zero, tolerance=TOLERANCE) for polygon in unmapped.geometry],
+        },
         "picture": {
             "png": base64.b64encode(picture).decode(),
             "bounds": [0.0, grid.ny * grid.resolution - down, across, grid.ny * grid.resolution],

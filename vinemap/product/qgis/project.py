@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 MARGIN = 0.06
 """Share of the parcel's size that the map shows about it."""
-GEOMETRY = {"parcel": "Polygon", "row_ends": "Point", "key_points": "Point"}
-LEGEND = ("rows", "gaps", "parcel", "chm")
+GEOMETRY = {"parcel": "Polygon", "unmapped": "Polygon", "row_ends": "Point", "key_points": "Point"}
+LEGEND = ("rows", "gaps", "unmapped", "parcel", "chm")
 
 
 class Entry(NamedTuple):
@@ -44,6 +44,7 @@ TREE: dict[str, list[Entry]] = {
         Entry("row_ends", "Ends (zoom in)"),
         Entry("gaps", "Gaps"),
         Entry("rows", "Rows: canopy volume per metre"),
+        Entry("unmapped", "In no row"),
     ],
     "Details": [
         Entry("key_points", "Key points (zoom in)", shown=False),
@@ -103,7 +104,7 @@ def project(
                 style = relief_style() if entry.name == "relief" else raster_style(kind, rasters[kind].values)
                 layer = _map_layer(entry, source, style, crs, provider="gdal", type="raster")
             drawn.append(layer)
-            members.append(_leaf(entry, source, expanded=entry.name in ("rows", "chm")))
+            members.append(_leaf(entry, source, expanded=entry.name in ("rows", "unmapped", "chm")))
         shown = any(entry.shown for entry in entries)
         state = "Qt::Checked" if shown else "Qt::Unchecked"
         groups.append(node("layer-tree-group", *members, name=group, checked=state, expanded=int(shown)))

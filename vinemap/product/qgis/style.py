@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
+from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.product.qgis.symbology import (
+    categorised,
     classes_of,
     graduated,
     hillshade,
@@ -37,6 +39,7 @@ WORDS = {
     "support": "Share of the length with canopy",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
+    "share": "Share of the parcel",
     "rows_length_m": "Length of all rows (m)",
     "bottom_m": "Bottom of the foliage (m)",
     "trv_m3_ha": "Tree-row volume (m³/ha)",
@@ -70,6 +73,8 @@ LIKELIHOODS = ("#ffffff", "#fee8c8", "#fdbb84", "#e34a33", "#7f0000")
 DIRECTIONS = ("#e0558d", "#e88a3c", "#b3b43a", "#4bb56b", "#3aa7c4", "#7377d9", "#e0558d")
 """A round of colours, as 180° is 0°."""
 CANOPY = ("#ccd9bf", "#ccd9bf", "#a9c19b", "#84a67c", "#5f8a61", "#3c6a4b")
+REASONS = {UNSEEN: "#c2185b", ALONE: "#ef6fa5", LOW: "#f0a202", WIDE: "#96582a", TALL: "#566a8c"}
+"""Colours of what is in no row, by the reason."""
 LOWEST_CANOPY, HIGHEST_CANOPY = 0.5, 2.5
 """Metres between which the canopies' height has its colours, the same in all parcels and surveys."""
 
@@ -83,6 +88,7 @@ SYMBOLS = {
     "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
     "track": ("line", [CASING | {"line_color": rgba(PAPER)}, {"line_color": rgba(TRACK), "line_width": "0.7"}]),
     "poses": ("marker", [{"outline_style": "no", "size": "1.3"}]),
+    "unmapped": ("fill", [{"outline_width": "0.4"}]),
     "parcel": (
         "fill",
         [{"style": "no", "outline_color": rgba("#5b3f8c"), "outline_width": "0.6", "outline_style": "dash"}],
@@ -100,6 +106,8 @@ MAP_TIPS = {
     "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
     "[% round(width_m, 2) %] m wide",
     "row_ends": "<b>Row [% label %]</b>, end [% end %]",
+    "unmapped": "<b>In no row: [% reason %]</b><br>[% round(area_m2) %] m², [% round(height_m, 1) %] m high, "
+    "closed over [% round(width_m, 1) %] m",
     "track": "<b>Stretch [% stretch %]</b><br>[% round(length_m, 2) %] m, [% n_poses %] poses",
     "poses": "<b>[% frame %]</b><br>heading [% round(heading_deg, 1) %]°<br>score [% round(score, 2) %]"
     "[% if(flag = '', '', '<br>flagged: ' || flag) %]",
@@ -151,7 +159,7 @@ def alias(column: str) -> str:
 
 
 def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
-    """Style of a layer of the contract; rows and sections have classes that fit their own values.
+    """Style of a layer of the contract; rows, sections and what is in no row have classes that fit their own values.
 
     Parameters
     ----------
@@ -166,6 +174,9 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
         renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
     elif layer == "sections":
         renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
+    elif layer == "unmapped":
+        there = {reason: shade for reason, shade in REASONS.items() if (table["reason"] == reason).any()}
+        renderer = categorised("reason", there or REASONS, symbol)
     elif layer == "poses":
         renderer = graduated(FLAGGED, MEASURED_OR_NOT, symbol)
     else:

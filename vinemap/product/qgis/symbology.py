@@ -73,6 +73,24 @@ def graduated(expression: str, classes: Sequence[Class], symbol: Symbol) -> Elem
     )
 
 
+def categorised(column: str, colours: Mapping[str, str], symbol: Symbol) -> Element:
+    """A fill whose last layer has the colour of a column's value, see-through but for its edge."""
+    kind, layers = symbol
+    shades = [{"color": rgba(f"{shade}70"), "outline_color": rgba(shade)} for shade in colours.values()]
+    symbols = [_symbol(str(k), (kind, [*layers[:-1], layers[-1] | own])) for k, own in enumerate(shades)]
+    categories = [
+        node("category", value=value, label=value, symbol=k, render="true") for k, value in enumerate(colours)
+    ]
+    return node(
+        "renderer-v2",
+        node("categories", *categories),
+        node("symbols", *symbols),
+        type="categorizedSymbol",
+        attr=column,
+        symbollevels=0,
+    )
+
+
 def _symbol(name: str, symbol: Symbol) -> Element:
     kind, layers = symbol
     drawn = [

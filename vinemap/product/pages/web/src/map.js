@@ -31,7 +31,7 @@ function pieces(row, profile, of) {
 
 export function showMap(rows, profiles, selected) {
   const map = plan("map");
-  for (const [name, above] of [["picture", 200], ["pieces", 410], ["halo", 405], ["hits", 450], ["numbers", 460]]) {
+  for (const [name, above] of [["picture", 200], ["unmapped", 402], ["pieces", 410], ["halo", 405], ["hits", 450], ["numbers", 460]]) {
     map.createPane(name).style.zIndex = above;
   }
   map.getPane("numbers").style.pointerEvents = "none";
@@ -45,6 +45,10 @@ export function showMap(rows, profiles, selected) {
   const points = [...rings.flat(), ...rows.flatMap((row) => row.line.points)];
   keepInSight(map, points.length ? boundsOf(points) : [[south, west], [north, east]]);
 
+  const beside = new SVG({ pane: "unmapped", padding: 0.5 });
+  const unmapped = data.unmapped.outline.map((outline, k) => new Polygon(outline.map((ring) => ring.map(place)), {
+    renderer: beside, weight: 1.5, fillOpacity: 0.25, className: "unmapped",
+  }).bindTooltip(() => hintUnmapped(k), { sticky: true, className: "about", opacity: 1 }).addTo(map));
   const canvas = new Canvas({ pane: "pieces", padding: 0.5 });
   const svg = new SVG({ pane: "hits", padding: 0.5 });
   const drawn = new LayerGroup().addTo(map);
@@ -85,6 +89,7 @@ export function showMap(rows, profiles, selected) {
     const quantity = QUANTITIES[chosen.value];
     drawn.clearLayers();
     outline.setStyle({ color: colour("outline") });
+    unmapped.forEach((one) => one.setStyle({ color: colour("unmapped") }));
     halo.setStyle({ color: colour("selected") });
     here.setStyle({ color: colour("paper"), fillColor: colour("selected") });
     if (!rows.length) return legend(null);
@@ -111,6 +116,7 @@ export function showMap(rows, profiles, selected) {
       quantity && element("span", {}, `${quantity.title}, ${quantity.unit}`),
       quantity && element("span", { class: "key" }, number(low, quantity.digits), bar, number(high, quantity.digits)),
       quantity && element("span", { class: "key" }, element("span", { class: "dash" }), "gap"),
+      unmapped.length ? element("span", { class: "key" }, element("span", { class: "patch" }), "in no row") : null,
       element("span", { class: "key" }, "heights 0", ink, `${number(tallest)} m`),
     ].filter(Boolean));
   }
@@ -134,12 +140,22 @@ export function showMap(rows, profiles, selected) {
   };
 }
 
+function hintUnmapped(k) {
+  const { reason, area_m2, height_m, width_m } = data.unmapped;
+  return about(`In no row: ${reason[k]}`, [
+    ["Area", `${number(area_m2[k], 1)} m²`], ["Height", `${number(height_m[k], 1)} m`], ["Closed over", `${number(width_m[k], 1)} m`],
+  ]);
+}
+
 function hint(row) {
-  const lines = [
+  return about(row.label, [
     ["Length", `${number(row.length_m, 1)} m`], ["Height", `${number(row.height_m, 2)} m`], ["Width", `${number(row.width_m, 2)} m`],
     ["Volume", `${number(row.volume_m3, 1)} m³, ${number(row.volume_m, 2)} a metre`],
     ["Gaps", `${number(row.gap_m, 1)} m, ${number(row.n_missing)} missing`],
-  ];
-  return element("div", {}, element("strong", {}, row.label),
+  ]);
+}
+
+function about(title, lines) {
+  return element("div", {}, element("strong", {}, title),
     element("dl", {}, ...lines.flatMap(([term, shown]) => [element("dt", {}, term), element("dd", {}, shown)])));
 }

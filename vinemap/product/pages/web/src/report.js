@@ -1,7 +1,7 @@
 // The page of a parcel.
 import { data, unpack, unpackJSON } from "./data.js";
 import { at, choice, element, number } from "./page.js";
-import { showHead, showQuality, showRecord } from "./words.js";
+import { showHead, showQuality, showRecord, showUnmapped } from "./words.js";
 import { measured } from "./line.js";
 import { showMap } from "./map.js";
 import { showPlots } from "./plots.js";
@@ -22,9 +22,10 @@ const done = (name) => performance.mark(name);
 
 showHead(data);
 showQuality(data, rows);
+showUnmapped(data);
 showRecord(data);
 if (rows.length) start();
-else at("table").append(element("p", { class: "empty" }, `No vine row was found in ${data.parcel}. The map shows what stands there; the warnings above may tell why.`));
+else at("table").append(element("p", { class: "empty" }, `No vine row was found in ${data.parcel}. The map shows what stands there, the warnings above tell why.`));
 if (!rows.length) {
   at("views").hidden = false;
   at("views").classList.add("alone");

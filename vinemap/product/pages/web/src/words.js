@@ -41,6 +41,19 @@ export function showQuality({ modelling, totals, counts }, rows) {
   ]);
 }
 
+/** What stands in no row, a line a reason. */
+export function showUnmapped({ unmapped }) {
+  const sums = new Map();
+  unmapped.reason.forEach((reason, k) => {
+    const { n, area, share } = sums.get(reason) ?? { n: 0, area: 0, share: 0 };
+    sums.set(reason, { n: n + 1, area: area + unmapped.area_m2[k], share: share + unmapped.share[k] });
+  });
+  const lines = [...sums].sort(([, one], [, other]) => other.area - one.area);
+  at("unmapped").hidden = !lines.length;
+  at("unmapped").append("In no row: ", lines.map(([reason, { n, area, share }]) =>
+    `${reason}, ${plural(n, "place")}, ${number(area)} m² (${number(100 * share, 1)}% of the parcel)`).join("; "), ".");
+}
+
 export function showRecord({ inputs, settings, versions, vinemap, crs, vertical_datum, origin, flown, counts }) {
   const line = (term, ...shown) => element("div", {}, element("dt", {}, term), element("dd", {}, ...shown));
   const code = (text) => element("code", {}, text);
