@@ -11,10 +11,11 @@ from scipy.interpolate import PchipInterpolator
 from shapely.ops import substring
 
 from vinemap.simulate.plants import Vineyard
-from vinemap.simulate.rays import Obstacle
-from vinemap.simulate.scenes import rows_of
+from vinemap.simulate.rays import Obstacle, Sheet
+from vinemap.simulate.scenes import rows_in, rows_of
 from vinemap.simulate.survey import Survey, simulate
 from vinemap.simulate.terrain import PLACE, hillside, terraced
+from vinemap.simulate.yard import hall, pallets, parked, place, posts, wall
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,23 +53,30 @@ def _block(rng: np.random.Generator, **shape: Any) -> list[Array]:
 def _survey(
     rng: np.random.Generator,
     *blocks: Sequence[Array],
-    canopy: dict[str, Any] | None = None,
+    canopy: dict[str, Any] | Sequence[dict[str, Any]] | None = None,
     slope: float | None = None,
     terrain: Terrain | None = None,
     ragged: float = 1.2,
     **options: Any,
 ) -> Survey:
-    """Survey blocks, a parcel each, whose rows end up to ``ragged`` m early; what isn't given is as it often is."""
+    """Survey blocks, a parcel each, whose rows end up to ``ragged`` m early; what isn't given is as it often is.
+
+    ``canopy`` is that of all blocks, or one for each.
+    """
     vines: dict[str, Any] = {
         "height": rng.uniform(1.6, 2.1),
         "half_width": rng.uniform(0.2, 0.32),
         "vine_spacing": rng.uniform(0.8, 1.1),
         "gaps": (2, 3, 4, 5),
     }
-    vines |= canopy or {}
-    lines = [[shapely.LineString(row) for row in block] for block in blocks]
-    cut = [[substring(line, *rng.uniform(0, ragged, 2) * (1, -1)) for line in block] for block in lines]
-    vineyards = [Vineyard(chr(65 + k), [np.array(c.coords) for c in block], **vines) for k, block in enumerate(cut)]
+    own = [canopy or {}] * len(blocks) if canopy is None or isinstance(canopy, dict) else canopy
+    lines: list[list[Any]] = [[shapely.LineString(row) for row in block] for block in blocks]
+    if ragged:
+        lines = [[substring(line, *rng.uniform(0, ragged, 2) * (1, -1)) for line in block] for block in lines]
+    vineyards = [
+        Vineyard(chr(65 + k), [np.array(c.coords) for c in block], **(vines | its))
+        for k, (block, its) in enumerate(zip(lines, own, strict=True))
+    ]
     steepness = rng.uniform(0.03, 0.3) if slope is None else slope
     hill = hillside(
         steepness, uphill=rng.uniform(0, 360), undulation=rng.uniform(0.05, 0.2), seed=int(rng.integers(1 << 31))
@@ -126,12 +134,10 @@ def _close(rng: np.random.Generator) -> Survey:
 def _clutter(rng: np.random.Generator) -> Survey:
     """Trees, a hut and a hedge around, and between the rows posts and a wire."""
     n, length, spacing, azimuth = 7, 45.0, rng.uniform(2.3, 2.8), rng.uniform(0, 180)
-    cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
     side = n / 2 * spacing
 
     def at(along: float, across: float, size: tuple[float, float], top: float, **kind: Any) -> Obstacle:
-        x, y = PLACE[0] + along * cos - across * sin, PLACE[1] + along * sin + across * cos
-        return Obstacle(x, y, *size, top, azimuth=azimuth, **kind)
+        return Obstacle(*place(PLACE, azimuth, along, across), *size, top, azimuth=azimuth, **kind)
 
     lanes = (rng.integers(1, n - 1, 6) - n / 2) * spacing
     obstacles = [at(rng.uniform(-22, 22), lane, (0.05, 0.05), 2.2, solid=True) for lane in lanes[1:]]
@@ -154,6 +160,83 @@ def _none(rng: np.random.Generator) -> Survey:
     obstacles += [Obstacle(x[11], y[11], 4.0, 3.0, 4.5, solid=True, azimuth=rng.uniform(0, 180))]
     outline = shapely.box(*np.add(PLACE, -30), *np.add(PLACE, 30))
     return _survey(rng, [], canopy={"gaps": (), "outline": outline}, density=200.0, weeds=0.4, obstacles=obstacles)
+
+
+def _square(rng: np.random.Generator) -> Survey:
+    """Bush vines as far apart along as across, some rows a vine or two shorter; rows are the longer lines."""
+    azimuth, spacing, n = rng.uniform(0, 180), rng.uniform(1.5, 2.5), int(rng.integers(7, 10))
+    crown = min(rng.uniform(0.9, 1.2), 0.7 * spacing)
+    vines = n + rng.integers(5, 9)
+    rows = rows_of(n, length=(vines - 1) * spacing + crown, spacing=spacing, azimuth=azimuth)
+    short = rng.integers(0, 3, (n, 2)) * spacing
+    lines = [shapely.LineString(row) for row in rows]
+    cut = [substring(line, a, line.length - b) for line, (a, b) in zip(lines, short, strict=True)]
+    rows = [np.array(line.coords) for line in cut]
+    heads: dict[str, Any] = {"height": rng.uniform(0.9, 1.3), "half_width": crown / 2, "bottom": 0.2, "crown": crown}
+    heads |= {"vine_spacing": spacing, "dead": 0.04, "gaps": (2, 2, 3)}
+    stakes = posts(rows, every=2 * spacing, top=rng.uniform(1.2, 2.0), beyond=1.0)
+    return _survey(rng, rows, canopy=heads, obstacles=stakes, ragged=0)
+
+
+def _pergola(rng: np.random.Generator) -> Survey:
+    """A closed roof of leaves, a little higher over the rows of its posts."""
+    azimuth, spacing, height = rng.uniform(0, 180), rng.uniform(2.8, 4.0), rng.uniform(1.8, 2.2)
+    rows = _block(rng, n=rng.integers(5, 8), spacing=spacing, azimuth=azimuth, length=rng.uniform(25, 35))
+    outline = shapely.MultiLineString(rows).convex_hull.buffer(spacing / 2, join_style="mitre")
+    roof = Sheet(outline, height, caught=rng.uniform(0.7, 0.8))
+    over_rows = {"height": height + 0.12, "bottom": height - 0.35, "half_width": rng.uniform(0.4, 0.6), "dead": 0.03}
+    trunks = posts(rows, every=5, top=height + 0.1)
+    return _survey(rng, rows, canopy=over_rows, sheets=[roof], obstacles=trunks, ragged=0.3)
+
+
+def _estate(rng: np.random.Generator) -> Survey:
+    """Blocks of two directions at a track, two more across a road, some rows wide, some young; a yard and a hedge."""
+    azimuth, track, road = rng.uniform(0, 180), rng.uniform(3, 5), rng.uniform(5, 7)
+    slant, half = rng.uniform(-0.4, 0.4), 14.0
+
+    def at(along: float, across: float) -> tuple[float, float]:
+        return place(PLACE, azimuth, along, across)
+
+    def row(across: float, start: float, end: float) -> Array:
+        return np.array(shapely.LineString([at(start, across), at(end, across)]).segmentize(0.25).coords)
+
+    spacing, close = rng.uniform(1.8, 2.3), rng.uniform(1.65, 1.8)
+    steps = [spacing] * 4 + [(spacing + close) / 2] + [close] * 3 + [(spacing + close) / 2] + [spacing] * 3
+    across = np.cumsum([0, *steps]) - sum(steps) / 2
+    main = [row(v, -half + slant * v, half) for v in across]
+    north = across[-1] + 1
+    far = [-half - track - 14.0 + slant * v for v in (-north, north)]
+    near = [-half - track + slant * v for v in (-north, north)]
+    west = shapely.Polygon([at(u, v) for u, v in zip([*far, *near[::-1]], [-north, north, north, -north], strict=True)])
+    turn = azimuth + rng.choice([-1, 1]) * rng.uniform(12, 60)
+    other = rows_in(west, spacing=rng.uniform(1.8, 2.4), azimuth=turn)
+    east, end = half + road, half + road + rng.uniform(12, 15)
+    old = [row(v, east, end) for v in np.arange(north, 1.5, -rng.uniform(1.8, 2.2))]
+    young = [row(v, east, end) for v in np.arange(-1.5, -8, -rng.uniform(1.8, 2.2))]
+    canopies: list[dict[str, Any]] = [
+        {},
+        {"half_width": close * rng.uniform(0.3, 0.34), "height": 1.7, "leafiness": 6.0, "gaps": (3,)},
+        {},
+        {"gaps": (2, 3)},
+        {"gaps": (2,)},
+        PLANTED_THIS_YEAR | {"height": rng.uniform(0.6, 1.0)},
+    ]
+    blocks = [main[:5], main[5:9], main[9:], other, old, young]
+    cars = parked(at(east, -11.5), n=int(rng.integers(4, 7)), apart=rng.uniform(2.4, 2.9), azimuth=azimuth, rng=rng)
+    n, apart = int(rng.integers(3, 6)), rng.uniform(1.3, 2.5)
+    stacks = pallets(at(east - 2, -15), n=n, apart=apart, azimuth=azimuth, rng=rng)
+    yard = [
+        hall(at(east + 9, -18.5), half_length=rng.uniform(5, 7), half_width=rng.uniform(2, 3), azimuth=azimuth),
+        wall(at(end + 2, -3), length=20, top=rng.uniform(1.2, 2), azimuth=azimuth + 90),
+        *[Obstacle(*at(u, north + 4), 1.8, 1.6, 4.5, bottom=0.9) for u in rng.uniform(-half, east, 3)],
+    ]
+    hedge = Vineyard(
+        "", [row(-north - rng.uniform(2.5, 4), -half, half)], rng.uniform(1.2, 2), rng.uniform(0.5, 0.8), bottom=0.0
+    )
+    trellis = posts([line for block in blocks for line in block])
+    about: dict[str, Any] = {"obstacles": [*cars, *stacks, *yard, *trellis], "beside": [hedge], "surroundings": 7.0}
+    about |= {"density": 200.0, "density_outside": 150.0}
+    return _survey(rng, *blocks, canopy=canopies, slope=rng.uniform(0.02, 0.1), ragged=0.8, **about)
 
 
 CLOSE_PLANTED = {"height": 1.15, "half_width": 0.17, "bottom": 0.35}
@@ -183,6 +266,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     "touching": _touching,
     "tall": lambda rng: _survey(rng, _block(rng, spacing=3), canopy=TALL),
     "young": lambda rng: _survey(rng, _block(rng), canopy=PLANTED_THIS_YEAR, weeds=0.1, ragged=0.5),
+    "square": _square,
+    "pergola": _pergola,
+    "estate": _estate,
 }
 """Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
 dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""

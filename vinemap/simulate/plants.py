@@ -37,6 +37,8 @@ class Vineyard:
     leafiness: float = 9.0
     """Leaves that a ray meets in a metre of foliage."""
     vine_spacing: float = 0.9
+    crown: float | None = None
+    """Length along the row of the head of a vine that stands alone, as bush vines do; by default shoots close up."""
     dead: float = 0.05
     """Share of single dead vines."""
     gaps: Sequence[int] = ()
@@ -79,9 +81,19 @@ class Stations(NamedTuple):
     leaves: Array  # (n, LAYERS) per metre
 
 
+def vines_along(vineyard: Vineyard, length: float) -> Array:
+    """Distances (n,) of the vines of a row so long from its start."""
+    if vineyard.crown is None:
+        n = max(round(length / vineyard.vine_spacing), 3)
+        return (np.arange(n) + 0.5) * (length / n)
+    n = max(round((length - vineyard.crown) / vineyard.vine_spacing) + 1, 3)
+    middles: Array = np.linspace(vineyard.crown / 2, length - vineyard.crown / 2, n)
+    return middles
+
+
 def dead_vines_of(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[np.bool_]]:
     """Which vines of every row are dead; never a row's first or last, so that rows end where they say."""
-    counts = [max(round(reached(row)[-1] / vineyard.vine_spacing), 3) for row in vineyard.rows]
+    counts = [len(vines_along(vineyard, reached(row)[-1])) for row in vineyard.rows]
     dead = [rng.random(n) < vineyard.dead for n in counts]
     order = rng.permutation(len(counts))
     for k, run in enumerate(vineyard.gaps):
@@ -109,24 +121,23 @@ def grow(
         along = np.gradient(xy, axis=0)
         along /= np.linalg.norm(along, axis=1, keepdims=True)
 
-        pitch = length / len(vines)
-        lows, highs = np.flatnonzero(np.diff(np.pad(vines.astype(int), 1))).reshape(-1, 2).T * pitch
-        lows, highs = lows + rng.uniform(-0.05, 0.12, len(lows)), highs - rng.uniform(-0.05, 0.12, len(highs))
-        lows, highs = np.append(lows, [-np.inf, length]), np.append(highs, [0.0, np.inf])
-        inside = np.maximum(lows[:, None] - arc, arc - highs[:, None]).min(axis=0)  # depth into the foliage
-
-        middles = (np.arange(len(vines)) + 0.5) * pitch
+        middles = vines_along(vineyard, length)
+        if vineyard.crown is None:
+            inside = _depth_in_hedge(arc, length, vines, rng)
+        else:
+            inside = _depth_in_heads(arc, middles, vines, vineyard.crown, rng)
         vigour, girth, lean, foot = (np.interp(arc, middles, rng.normal(size=len(vines))) for _ in range(4))
         fine = gaussian_filter1d(rng.normal(size=(2, n)), 1.0, axis=1)
         smooth = waves(rng, 18.0)
         shoots = (rng.random((2, n)) < [[0.04], [0.03]]) * rng.random((2, n))
         bottom = vineyard.bottom + 0.04 * foot
         top = vineyard.height * (1 + 0.03 * smooth(arc, arc) + 0.035 * vigour + 0.03 * fine[0]) + 0.4 * shoots[0]
-        top = np.maximum(top - 0.2 * (top - bottom) * np.clip(1 - inside / 0.25, 0, 1), bottom + 0.2)
+        round_over, lower = (0.25, 0.2) if vineyard.crown is None else (vineyard.crown / 2, 0.5)
+        top = np.maximum(top - lower * (top - bottom) * np.clip(1 - inside / round_over, 0, 1), bottom + 0.2)
         half_width = vineyard.half_width * (1 + 0.08 * smooth(arc, -arc) + 0.1 * girth + 0.1 * fine[1])
-        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(
-            np.clip(inside / (0.45 * vineyard.half_width), 0, 1)
-        )
+        to_full = 0.45 * vineyard.half_width if vineyard.crown is None else vineyard.crown / 2
+        share = np.clip(inside / to_full, 0, 1)
+        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(share)
         half_width[inside <= 0] = -1.0
         thinning = np.linspace(0.5, 1.1, LAYERS)  # towards the shaded foot, of which little is ever matched
         leaves = vineyard.leafiness * thinning * rng.gamma(1.5, 1 / 1.5, (n, LAYERS))
@@ -143,9 +154,29 @@ def grow(
     return Stations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def foliage_of(stations: Stations) -> Foliage:
-    """What of the stations is alive."""
-    alive = stations.half_width > 0
+def _depth_in_hedge(arc: Array, length: float, dead: NDArray[np.bool_], rng: np.random.Generator) -> Array:
+    """Metres from stations to where the hedge of a row ends, at its ends and at dead vines; negative in the open."""
+    lows, highs = np.flatnonzero(np.diff(np.pad(dead.astype(int), 1))).reshape(-1, 2).T * (length / len(dead))
+    lows, highs = lows + rng.uniform(-0.05, 0.12, len(lows)), highs - rng.uniform(-0.05, 0.12, len(highs))
+    lows, highs = np.append(lows, [-np.inf, length]), np.append(highs, [0.0, np.inf])
+    depth: Array = np.maximum(lows[:, None] - arc, arc - highs[:, None]).min(axis=0)
+    return depth
+
+
+def _depth_in_heads(
+    arc: Array, middles: Array, dead: NDArray[np.bool_], crown: float, rng: np.random.Generator
+) -> Array:
+    """As much as half a crown in the middle of a head, from which it falls like a parabola to 0 at its edge."""
+    reach = crown / 2 * rng.uniform(0.85, 1.0, len(middles))
+    reach[[0, -1]] = crown / 2
+    vine = np.abs(arc[:, None] - middles).argmin(axis=1)
+    depth = crown / 2 * (1 - ((arc - middles[vine]) / reach[vine]) ** 2)
+    return np.where(dead[vine], -1.0, depth)
+
+
+def foliage_of(stations: Stations, rows: int) -> Foliage:
+    """What of the stations of so many rows, the first, is alive."""
+    alive = (stations.half_width > 0) & (stations.row < rows)
     row, xy, step = stations.row[alive], stations.xy[alive], stations.step[alive]
     top, bottom = stations.top[alive], stations.bottom[alive]
     return Foliage(row, xy, step, top, bottom, stations.half_width[alive], stations.shift[alive])

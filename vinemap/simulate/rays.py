@@ -1,4 +1,4 @@
-"""Rays from above that meet leaves, trees, huts, or the ground."""
+"""Rays from above that meet leaves, trees, huts, roofs of leaves, nets, or the ground."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 
 from vinemap.simulate.plants import EDGE, LAYERS, Stations, bulge
+from vinemap.simulate.terrain import waves
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from vinemap.simulate.terrain import Array, Terrain
@@ -21,7 +25,7 @@ TAN_WIDEST = math.tan(math.radians(35))
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A tree or bush (ellipsoid of leaves), or a hut, post or wire (solid box); metres, heights above its ground."""
+    """A tree or bush (ellipsoid of leaves), or a hut, post or wall (solid box); metres, heights above its ground."""
 
     x: float
     y: float
@@ -32,6 +36,26 @@ class Obstacle:
     solid: bool = False
     azimuth: float = 0.0
     """Direction of its length, degrees anticlockwise from east."""
+    eaves: float | None = None
+    """Height at which the roof of a solid begins that is a ridge along its length; by default the roof is flat."""
+
+    @property
+    def reach(self) -> float:
+        """Metres from its middle within which a ray may end that it meets."""
+        return math.hypot(self.half_length, self.half_width) + TAN_WIDEST * self.top + 1
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What spreads over rows: a closed roof of leaves, or a net; metres above ground."""
+
+    outline: shapely.Polygon
+    height: float
+    """Of its upper side, on the mean; it sags and bulges by ``sag``."""
+    depth: float = 0.3
+    caught: float = 0.75
+    """Share of rays that it stops, more in some patches than in others."""
+    sag: float = 0.05
 
 
 def meet_leaves(
@@ -92,11 +116,33 @@ def meet_leaves(
     return met
 
 
+def meet_things(
+    rays: tuple[Array, Array],
+    southings: Array,
+    obstacles: Sequence[Obstacle],
+    sheets: Sequence[Sheet],
+    terrain: Terrain,
+    rng: np.random.Generator,
+) -> Array:
+    """Height above ``aim`` at which rays meet the first of obstacles and sheets, 0 where they meet none.
+
+    ``southings`` (n,) ascend: the y of rays' ends, to within a metre.
+    """
+    aim, lean = rays
+    met = np.zeros(len(aim))
+    for obstacle in obstacles:
+        reach = obstacle.reach + 1
+        near = slice(*np.searchsorted(southings, [obstacle.y - reach, obstacle.y + reach]))
+        met[near] = np.maximum(met[near], meet_obstacle(aim[near], lean[near], obstacle, terrain, rng))
+    for sheet in sheets:
+        met = np.maximum(met, meet_sheet(aim, lean, sheet, terrain, rng))
+    return met
+
+
 def meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain, rng: np.random.Generator) -> Array:
     """Height above ``aim`` at which rays meet a tree or a hut, 0 where they don't."""
     met = np.zeros(len(aim))
-    reach = math.hypot(obstacle.half_length, obstacle.half_width) + TAN_WIDEST * obstacle.top + 1
-    near = np.flatnonzero(np.hypot(aim[:, 0] - obstacle.x, aim[:, 1] - obstacle.y) < reach)
+    near = np.flatnonzero(np.hypot(aim[:, 0] - obstacle.x, aim[:, 1] - obstacle.y) < obstacle.reach)
     ground = float(terrain(np.array([obstacle.x]), np.array([obstacle.y]))[0])
     half_height = (obstacle.top - obstacle.bottom) / 2
     half = np.array([obstacle.half_length, obstacle.half_width, half_height])
@@ -109,6 +155,12 @@ def meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain,
         way = np.where(np.abs(way) < 1e-9, 1e-9, way)
         faces = np.sort([(-1 - start) / way, (1 - start) / way], axis=0)
         low, high = faces[0].max(axis=1), faces[1].min(axis=1)
+        if obstacle.eaves is not None:
+            pitch = (obstacle.top - obstacle.eaves) / half_height
+            for side in (pitch, -pitch):
+                above, steepness = start[:, 2] + side * start[:, 1] - 1, way[:, 2] + side * way[:, 1]
+                high = np.minimum(high, np.where(steepness > 0, -above / steepness, np.inf))
+                low = np.maximum(low, np.where(steepness < 0, -above / steepness, -np.inf))
         rise = high
     else:
         a, b, c = (way**2).sum(axis=1), (way * start).sum(axis=1), (start**2).sum(axis=1) - 1
@@ -116,4 +168,18 @@ def meet_obstacle(aim: Array, lean: Array, obstacle: Obstacle, terrain: Terrain,
         low, high = (-b - root) / a, (-b + root) / a
         rise = high - rng.exponential(0.35, len(near))
     met[near] = np.where((rise > np.maximum(low, 0)) & (high > low), rise, 0)
+    return met
+
+
+def meet_sheet(aim: Array, lean: Array, sheet: Sheet, terrain: Terrain, rng: np.random.Generator) -> Array:
+    """Height above ``aim`` at which rays meet a roof of leaves or a net, 0 where they don't."""
+    at = aim[:, :2] + sheet.height * lean
+    shapely.prepare(sheet.outline)
+    under = np.flatnonzero(shapely.contains_xy(sheet.outline, *at.T))
+    at, n = at[under], len(under)
+    sag, patches = waves(rng, 5.0), waves(rng, 1.5)
+    rise = sheet.height + sheet.sag * sag(*at.T) + terrain(*at.T) - aim[under, 2]
+    rise -= sheet.depth * np.minimum(rng.exponential(0.4, n), 1)
+    met = np.zeros(len(aim))
+    met[under] = np.where(rng.random(n) < sheet.caught + 0.15 * patches(*at.T), np.maximum(rise, 0), 0)
     return met

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 from scipy.interpolate import PchipInterpolator
 
 from vinemap import paths
@@ -66,6 +67,30 @@ def rows_of(
         cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         rows.append(np.column_stack([centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos]))
     return rows
+
+
+def rows_in(
+    outline: shapely.Polygon, *, spacing: float = 2.5, azimuth: float = 0.0, shortest: float = 6.0
+) -> list[Array]:
+    """Straight rows that fill a convex outline from edge to edge, as those of a block do that ends at tracks.
+
+    Parameters
+    ----------
+    spacing, azimuth : float
+        As of :func:`rows_of`.
+    shortest : float
+        Metres below which a corner is left without a row.
+
+    Returns
+    -------
+    list of array (m, 2)
+    """
+    x, y = outline.centroid.coords[0]
+    reach = float(shapely.hausdorff_distance(outline.centroid, outline))
+    n = 2 * int(reach / spacing) + 1
+    lines = rows_of(n, length=2 * reach, spacing=spacing, azimuth=azimuth, centre=(x, y))
+    inside = shapely.intersection([shapely.LineString(line) for line in lines], outline)
+    return [np.array(line.segmentize(0.25).coords) for line in inside if line.length >= shortest]
 
 
 def barolo(

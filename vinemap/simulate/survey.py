@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from vinemap import paths
 from vinemap.simulate.plants import Foliage, Vineyard, dead_vines_of, foliage_of, grow
-from vinemap.simulate.rays import TAN_WIDEST, Obstacle, meet_leaves, meet_obstacle
+from vinemap.simulate.rays import TAN_WIDEST, Obstacle, Sheet, meet_leaves, meet_things
 from vinemap.simulate.terrain import Array, Terrain, waves
 from vinemap.simulate.truth import truth_of
 
@@ -64,6 +64,8 @@ def simulate(
     density_outside: float = 60.0,
     surroundings: float = 6.0,
     obstacles: Sequence[Obstacle] = (),
+    sheets: Sequence[Sheet] = (),
+    beside: Sequence[Vineyard] = (),
     weeds: float = 0.15,
     noise: float = 0.025,
     bled: float = 0.01,
@@ -82,7 +84,11 @@ def simulate(
         Rays a square metre (30% more or less, in patches; nearly as many points) inside the parcels, and on
         the ``surroundings`` m about their common hull.
     obstacles : sequence of Obstacle
-        Trees and huts.
+        Trees, huts, cars, posts.
+    sheets : sequence of Sheet
+        Roofs of leaves, nets.
+    beside : sequence of Vineyard
+        What grows in rows and is no vine: hedges, strips of a cover crop. It's in none of the tables of truth.
     weeds : float
         Height (m) of the weeds, which cover about a quarter of the ground in patches.
     noise : float
@@ -93,8 +99,10 @@ def simulate(
         The same seed gives the same survey.
     """
     rng = np.random.default_rng(seed)
-    dead = [vines for vineyard in vineyards for vines in dead_vines_of(vineyard, rng)]
-    stations = grow(vineyards, dead, terrain, rng)
+    grown = [*vineyards, *beside]
+    dead = [vines for vineyard in grown for vines in dead_vines_of(vineyard, rng)]
+    stations = grow(grown, dead, terrain, rng)
+    dead = dead[: sum(len(vineyard.rows) for vineyard in vineyards)]
     rows, dead_vines, gaps, parcels = truth_of(vineyards, dead, stations, terrain, crs)
     hulls = shapely.union_all(parcels.geometry.to_numpy())
     outline = hulls.convex_hull.buffer(surroundings)
@@ -131,8 +139,8 @@ def simulate(
         rise = meet_leaves((aim, lean), upper, 1.6, stations, rng)
         two = np.flatnonzero(row_at[upper] != row_at[lower])
         rise[two] = np.maximum(rise[two], meet_leaves((aim[two], lean[two]), lower[two], 0.5, stations, rng))
-        for obstacle in obstacles:
-            rise = np.maximum(rise, meet_obstacle(aim, lean, obstacle, terrain, rng))
+        southings = centres[cells, 1]  # cells come from south to north
+        rise = np.maximum(rise, meet_things((aim, lean), southings, obstacles, sheets, terrain, rng))
 
         leaf = rise > 0
         edges = np.flatnonzero(leaf)
@@ -146,9 +154,8 @@ def simulate(
         flyers = np.flatnonzero(rng.random(n) < floaters)
         points[flyers, 2] += rng.choice([-1, 1], len(flyers)) * rng.uniform(0.5, 8.0, len(flyers))
         clouds.append(points[leaf | (rng.random(n) >= hidden[cells])])
-    return Survey(
-        name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain, foliage_of(stations)
-    )
+    foliage = foliage_of(stations, len(rows))
+    return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain, foliage)
 
 
 def write_survey(survey: Survey, folder: Path | str) -> Path:

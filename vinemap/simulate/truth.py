@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.simulate.plants import Stations, Vineyard, on_ground, reached
+from vinemap.simulate.plants import Stations, Vineyard, on_ground, reached, vines_along
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,23 +25,24 @@ def truth_of(
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Tables of rows, dead vines, gaps and parcels, as :class:`vinemap.simulate.survey.Survey` has them."""
     rows, spots, gaps = [], [], []
-    plots = [(vineyard.name, i, row) for vineyard in vineyards for i, row in enumerate(vineyard.rows, 1)]
-    for k, ((name, i, row), vines) in enumerate(zip(plots, dead, strict=True)):
-        length = reached(row)[-1]
+    plots = [(vineyard, i, row) for vineyard in vineyards for i, row in enumerate(vineyard.rows, 1)]
+    for k, ((vineyard, i, row), vines) in enumerate(zip(plots, dead, strict=True)):
+        name, length = vineyard.name, reached(row)[-1]
         line = on_ground(row, np.linspace(0, length, math.ceil(length / 0.25) + 1), terrain)
         own = (stations.row == k) & (stations.arc > 0) & (stations.arc < length)
         alive = own & (stations.half_width > 0)
         height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean()
         rows.append((name, i, reached(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
         gone = np.flatnonzero(vines)
-        middles = (gone + 0.5) * length / len(vines)
+        middles = vines_along(vineyard, length)[gone]
         points = on_ground(row, middles, terrain)
         spots += [(name, i, vine + 1, shapely.Point(point)) for vine, point in zip(gone, points, strict=True)]
         bare = np.flatnonzero(np.diff(np.pad(stations.half_width[own] <= 0, 1).astype(int))).reshape(-1, 2)
         for start, end in bare * stations.step[own][0]:
             piece = on_ground(row, np.linspace(start, end, math.ceil((end - start) / 0.25) + 1), terrain)
             missing = np.count_nonzero((middles > start) & (middles < end))
-            gaps.append((name, i, missing, shapely.LineString(piece)))
+            if missing:  # else a way between two heads
+                gaps.append((name, i, missing, shapely.LineString(piece)))
     outlines = [(v.name, v.outline or shapely.MultiLineString(v.rows).convex_hull.buffer(3.0)) for v in vineyards]
     canopy = ["length_3d", "n_vines", "n_dead", "mean_height", "mean_width"]
 

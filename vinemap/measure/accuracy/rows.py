@@ -45,7 +45,7 @@ class Errors(NamedTuple):
     recalled: Flags
     """Whether a dead vine with a dead neighbour lies by a gap."""
     right: Flags
-    """Whether a long gap lies by such a vine."""
+    """Whether a long gap lies by a dead vine."""
     gap_length: Floats
     """|error| of the length (m) of gaps of two vines or more."""
 
@@ -148,7 +148,7 @@ def _gap_errors(survey: Survey, gaps: gpd.GeoDataFrame) -> tuple[Flags, Flags, F
     pieces = shapely.force_2d(gaps.geometry.to_numpy())
     recalled = shapely.distance(spots, shapely.union_all(pieces)) < NEAR
     long = pieces[shapely.length(pieces) >= LONG]
-    right = shapely.distance(long, shapely.union_all(spots)) < NEAR
+    right = shapely.distance(long, shapely.union_all(shapely.force_2d(dead.geometry.to_numpy()))) < NEAR
     errors = []
     for true in shapely.force_2d(survey.gaps.geometry[survey.gaps["n_vines"] >= 2].to_numpy()):
         by = pieces[shapely.dwithin(pieces, true, NEAR / 2)]

@@ -1,0 +1,64 @@
+"""What stands about a vineyard and is no vine: posts of the trellis, and a yard's cars, pallets, hall and walls."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinemap.simulate.plants import at, reached
+from vinemap.simulate.rays import Obstacle
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from vinemap.simulate.terrain import Array
+
+
+Spot = tuple[float, float]
+"""x and y, m."""
+
+
+def place(centre: Spot, azimuth: float, along: float, across: float) -> Spot:
+    """Point that lies so far along an azimuth (degrees anticlockwise from east) from a centre, and to its left."""
+    cos, sin = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
+    return centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos
+
+
+def posts(rows: Sequence[Array], *, every: float = 5.0, top: float = 2.0, beyond: float = 0.0) -> list[Obstacle]:
+    """Posts of 8 cm in rows, every so many metres; the outermost stand ``beyond`` m outside of the rows' ends."""
+    spots = []
+    for row in rows:
+        length = reached(row)[-1]
+        ends = row[[0, -1]] + beyond * (row[[0, -1]] - row[[1, -2]]) / reached(row)[1]
+        spots += [*ends, *at(row, np.linspace(0, length, max(round(length / every), 1) + 1)[1:-1])]
+    return [Obstacle(x, y, 0.04, 0.04, top, solid=True) for x, y in spots]
+
+
+def parked(first: Spot, *, n: int, apart: float, azimuth: float, rng: np.random.Generator) -> list[Obstacle]:
+    """Cars side by side, from the first towards an azimuth: bonnets and cabins."""
+    out = []
+    for k in range(n):
+        height, half_length, askew = rng.uniform(1.4, 1.9), rng.uniform(1.9, 2.3), azimuth + 90 + rng.normal(0, 2)
+        x, y = place(first, azimuth, k * apart, rng.normal(0, 0.2))
+        out.append(Obstacle(x, y, half_length, 0.87, 0.6 * height, bottom=0.2, solid=True, azimuth=askew))
+        x, y = place((x, y), askew, -0.15 * half_length, 0.0)
+        out.append(Obstacle(x, y, 0.6 * half_length, 0.8, height, bottom=0.2, solid=True, azimuth=askew))
+    return out
+
+
+def pallets(first: Spot, *, n: int, apart: float, azimuth: float, rng: np.random.Generator) -> list[Obstacle]:
+    """Stacks of pallets or crates in a row, some higher than others."""
+    spots = [place(first, azimuth, k * apart, rng.normal(0, 0.1)) for k in range(n)]
+    return [Obstacle(*spot, 0.6, 0.5, rng.uniform(0.6, 2.0), solid=True, azimuth=azimuth) for spot in spots]
+
+
+def hall(centre: Spot, *, half_length: float, half_width: float, azimuth: float) -> Obstacle:
+    """A hall with a ridged roof, eaves at 2.6 m."""
+    return Obstacle(*centre, half_length, half_width, 2.6 + half_width / 2, solid=True, azimuth=azimuth, eaves=2.6)
+
+
+def wall(centre: Spot, *, length: float, top: float, azimuth: float) -> Obstacle:
+    """A wall 0.3 m thick."""
+    return Obstacle(*centre, length / 2, 0.15, top, solid=True, azimuth=azimuth)
