@@ -121,3 +121,50 @@ def test_square_plantings_are_as_close_along_as_across():
     alive = survey.rows.n_vines.sum() - survey.rows.n_dead.sum()
     blobs = shapely.union_all(shapely.points(survey.foliage.xy)).buffer(0.2)
     assert len(blobs.geoms) == alive
+
+
+def test_two_curtains_hang_on_one_row():
+    rows = rows_of(2, length=14, spacing=4.0)
+    vines = Vineyard("gdc", rows, curtains=1.0, height=1.6, bottom=0.8, half_width=0.22, dead=0.0, gaps=(3,))
+    survey, xyz = seen([vines])
+    assert len(survey.rows) == 2
+    np.testing.assert_allclose(survey.rows.mean_width, 1.44, atol=0.15)
+    assert list(survey.gaps.n_vines) == [3]
+    x, y, _ = xyz[(np.abs(xyz[:, 0]) < 6.5) & (xyz[:, 2] > 0.7)].T
+    off = np.abs(y) - 2
+    assert np.mean(off > 0) == pytest.approx(0.5, abs=0.08)
+    assert np.median(np.abs(off)) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(np.abs(off) < 0.15) < 0.02
+    gap = shapely.get_coordinates(survey.gaps.geometry.iloc[0])[[0, -1]] - PLACE
+    within = (x > gap[:, 0].min() + 0.3) & (x < gap[:, 0].max() - 0.3) & (np.abs(y - gap[0, 1]) < 1)
+    assert within.sum() < 0.01 * len(x)
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "height", "bar"),
+    [("sprawl", (1.4, 1.75), (1.5, 2.0), 0.75), ("full-crowns", (1.9, 2.5), (2.8, 3.3), 0.6)],
+)
+def test_wide_canopies_stand_on_their_rows(name, width, height, bar):
+    survey = family(name, 1)
+    assert survey.rows.mean_width.between(*width).all()
+    assert survey.rows.mean_height.between(*height).all()
+    lines = shapely.force_2d(survey.rows.geometry.to_numpy())
+    spacing = shapely.distance(lines[1], lines[2])
+    assert 0.4 < survey.rows.mean_width.mean() / spacing < bar
+    up = survey.xyz[:, 2] - survey.terrain(*survey.xyz[:, :2].T) > 0.6
+    xy = survey.xyz[up, :2]
+    for line in lines:
+        near = xy[shapely.contains_xy(line.buffer(0.55 * width[1], cap_style="flat"), *xy.T)]
+        (x0, y0), (x1, y1) = line.coords[0], line.coords[-1]
+        left = ((x1 - x0) * (near[:, 1] - y0) - (y1 - y0) * (near[:, 0] - x0)) / line.length
+        assert abs(np.quantile(left, 0.03) + np.quantile(left, 0.97)) < 0.2
+        assert np.ptp(np.quantile(left, [0.02, 0.98])) == pytest.approx(survey.rows.mean_width.mean(), abs=0.35)
+
+
+def test_strips_are_half_as_high_and_twice_as_wide_as_their_rows():
+    survey = family("strips", 0)
+    height = survey.xyz[:, 2] - survey.terrain(*survey.xyz[:, :2].T)
+    lines = shapely.force_2d(survey.rows.geometry.to_numpy())
+    middle = shapely.LineString((np.array(lines[0].coords)[[5, -5]] + np.array(lines[1].coords)[[5, -5]]) / 2)
+    near = shapely.contains_xy(middle.buffer(0.15, cap_style="flat"), *survey.xyz[:, :2].T) & (height > 0.2)
+    assert np.quantile(height[near], 0.9) == pytest.approx(survey.rows.mean_height.mean() / 2, abs=0.15)

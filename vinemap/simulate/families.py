@@ -189,6 +189,38 @@ def _pergola(rng: np.random.Generator) -> Survey:
     return _survey(rng, rows, canopy=over_rows, sheets=[roof], obstacles=trunks, ragged=0.3)
 
 
+def _strips(rng: np.random.Generator) -> Survey:
+    """Strips of a cover crop half as high and twice as wide as the rows, in every alley or every other one."""
+    n, spacing, azimuth, length = 8, rng.uniform(2.4, 2.9), rng.uniform(0, 180), rng.uniform(30, 40)
+    vines = {"height": rng.uniform(1.7, 2.0), "half_width": rng.uniform(0.23, 0.28)}
+    rows = rows_of(n, length=length, spacing=spacing, azimuth=azimuth)
+    alleys = rows_of(n - 1, length=length, spacing=spacing, azimuth=azimuth)[:: rng.integers(1, 3)]
+    crop = Vineyard("", alleys, vines["height"] / 2, 2 * vines["half_width"], bottom=0.0, dead=0.03)
+    return _survey(rng, rows, canopy=vines, beside=[crop])
+
+
+def _double(rng: np.random.Generator) -> Survey:
+    """Geneva double curtain: two curtains hang about a metre apart over one line of trunks."""
+    rows = _block(rng, n=6, spacing=rng.uniform(3.6, 4.2))
+    curtains = {"curtains": rng.uniform(0.9, 1.2), "height": rng.uniform(1.5, 1.8), "bottom": 0.8}
+    return _survey(rng, rows, canopy=curtains | {"half_width": rng.uniform(0.2, 0.3)}, obstacles=posts(rows, top=1.7))
+
+
+def _sprawl(rng: np.random.Generator) -> Survey:
+    """Untrained shoots 1.6 m wide, which all but touch in the alleys."""
+    rows = _block(rng, spacing=rng.uniform(2.2, 2.6), length=rng.uniform(30, 40))
+    vines = {"height": rng.uniform(1.6, 1.9), "half_width": rng.uniform(0.76, 0.82), "leafiness": 6.0}
+    return _survey(rng, rows, canopy=vines | {"gaps": (2, 3)}, obstacles=posts(rows))
+
+
+def _net(rng: np.random.Generator) -> Survey:
+    """A net above the vines that a third of the rays don't pass."""
+    rows = _block(rng, length=rng.uniform(28, 35), n=7)
+    outline = shapely.MultiLineString(rows).convex_hull.buffer(1.0)
+    net = Sheet(outline, rng.uniform(3.0, 3.4), depth=0.03, caught=rng.uniform(0.3, 0.4))
+    return _survey(rng, rows, sheets=[net], obstacles=posts(rows, top=net.height))
+
+
 def _estate(rng: np.random.Generator) -> Survey:
     """Blocks of two directions at a track, two more across a road, some rows wide, some young; a yard and a hedge."""
     azimuth, track, road = rng.uniform(0, 180), rng.uniform(3, 5), rng.uniform(5, 7)
@@ -240,6 +272,7 @@ def _estate(rng: np.random.Generator) -> Survey:
 
 
 CLOSE_PLANTED = {"height": 1.15, "half_width": 0.17, "bottom": 0.35}
+FULL_CROWNS = {"height": 3.1, "bottom": 0.6, "vine_spacing": 1.8, "leafiness": 4.0, "gaps": (1, 2, 2)}
 TALL = {"height": 3.1, "half_width": 0.35, "bottom": 0.8}
 PLANTED_THIS_YEAR = {"height": 0.6, "half_width": 0.09, "bottom": 0.1, "leafiness": 20.0, "dead": 0.02, "gaps": (2, 3)}
 FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
@@ -269,6 +302,15 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     "square": _square,
     "pergola": _pergola,
     "estate": _estate,
+    "strips": _strips,
+    "double": _double,
+    "full-crowns": lambda rng: _survey(
+        rng,
+        _block(rng, n=6, spacing=rng.uniform(4.0, 4.5), length=rng.uniform(30, 40)),
+        canopy=FULL_CROWNS | {"half_width": rng.uniform(1.0, 1.2)},
+    ),
+    "sprawl": _sprawl,
+    "net": _net,
 }
 """Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
 dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""

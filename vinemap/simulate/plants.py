@@ -39,6 +39,8 @@ class Vineyard:
     vine_spacing: float = 0.9
     crown: float | None = None
     """Length along the row of the head of a vine that stands alone, as bush vines do; by default shoots close up."""
+    curtains: float | None = None
+    """Distance between two curtains that the vines of one row feed; by default there is one, on the row."""
     dead: float = 0.05
     """Share of single dead vines."""
     gaps: Sequence[int] = ()
@@ -48,12 +50,12 @@ class Vineyard:
 
 
 class Foliage(NamedTuple):
-    """The canopy of all living stretches of rows at stations (n,), metres."""
+    """The canopy of all living stretches of rows, curtain by curtain, at stations (n,), metres."""
 
     row: NDArray[np.intp]
     """Position of the row in the table of rows."""
     xy: Array
-    """(n, 2) on the row's line."""
+    """(n, 2) on the row's line, or the curtain's."""
     step: Array
     """Length of row that the station stands for."""
     top: Array
@@ -66,7 +68,7 @@ class Foliage(NamedTuple):
 
 
 class Stations(NamedTuple):
-    """Canopy in cells along all rows, concatenated; every row goes on bare for BARE cells at both ends."""
+    """Canopy in cells along all curtains, concatenated; each goes on bare for BARE cells at both ends."""
 
     row: NDArray[np.intp]
     xy: Array
@@ -85,7 +87,7 @@ def vines_along(vineyard: Vineyard, length: float) -> Array:
     """Distances (n,) of the vines of a row so long from its start."""
     if vineyard.crown is None:
         n = max(round(length / vineyard.vine_spacing), 3)
-        return (np.arange(n) + 0.5) * (length / n)
+        return (np.arange(n, dtype=np.float64) + 0.5) * (length / n)
     n = max(round((length - vineyard.crown) / vineyard.vine_spacing) + 1, 3)
     middles: Array = np.linspace(vineyard.crown / 2, length - vineyard.crown / 2, n)
     return middles
@@ -111,7 +113,12 @@ def grow(
     """The canopy of all rows, of which some vines are dead."""
     parts = []
     plots = [(vineyard, row) for vineyard in vineyards for row in vineyard.rows]
-    for k, ((vineyard, row), vines) in enumerate(zip(plots, dead, strict=True)):
+    lines = [
+        (k, vineyard, row, side, vines)
+        for k, ((vineyard, row), vines) in enumerate(zip(plots, dead, strict=True))
+        for side in ((0.0,) if vineyard.curtains is None else (vineyard.curtains / 2, -vineyard.curtains / 2))
+    ]
+    for k, vineyard, row, side, vines in lines:
         length = reached(row)[-1]
         step = length / math.ceil(length / STATION)
         arc = (np.arange(-BARE, round(length / step) + BARE) + 0.5) * step
@@ -120,6 +127,7 @@ def grow(
         xy = at(np.vstack([row[0] - beyond[0], row, row[-1] + beyond[1]]), arc + BARE * step)
         along = np.gradient(xy, axis=0)
         along /= np.linalg.norm(along, axis=1, keepdims=True)
+        xy = xy + side * np.column_stack([-along[:, 1], along[:, 0]])
 
         middles = vines_along(vineyard, length)
         if vineyard.crown is None:

@@ -118,7 +118,8 @@ def simulate(
     rays = np.repeat(np.arange(len(centres)), rng.poisson(rate * CELL**2))
     heading = rng.uniform(0, 2 * np.pi) + 0.8 * waves(rng, 35.0)(*centres.T)
     tufts = weeds * np.clip(waves(rng, 7.0)(*centres.T) - 0.6, 0, 0.8) / 0.8
-    row_at = np.append(stations.row, -1)  # a cell with no row near names the station past the last
+    line = np.cumsum(np.diff(stations.arc, prepend=np.inf) < 0)  # distances begin anew at each
+    line_at = np.append(line, 0)  # a cell with no row near names the station past the last
     hidden = 0.65 * (distance < np.append(stations.half_width, -1.0)[nearest])
 
     def nearest_at(xy: Array) -> NDArray[np.intp]:
@@ -137,7 +138,7 @@ def simulate(
         # A leaning ray may pass one row high up and its neighbour low down.
         upper, lower = nearest_at(xy + 1.6 * lean), nearest_at(xy + 0.5 * lean)
         rise = meet_leaves((aim, lean), upper, 1.6, stations, rng)
-        two = np.flatnonzero(row_at[upper] != row_at[lower])
+        two = np.flatnonzero(line_at[upper] != line_at[lower])
         rise[two] = np.maximum(rise[two], meet_leaves((aim[two], lean[two]), lower[two], 0.5, stations, rng))
         southings = centres[cells, 1]  # cells come from south to north
         rise = np.maximum(rise, meet_things((aim, lean), southings, obstacles, sheets, terrain, rng))

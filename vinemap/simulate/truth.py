@@ -31,13 +31,14 @@ def truth_of(
         line = on_ground(row, np.linspace(0, length, math.ceil(length / 0.25) + 1), terrain)
         own = (stations.row == k) & (stations.arc > 0) & (stations.arc < length)
         alive = own & (stations.half_width > 0)
-        height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean()
+        height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean() + (vineyard.curtains or 0)
         rows.append((name, i, reached(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
         gone = np.flatnonzero(vines)
         middles = vines_along(vineyard, length)[gone]
         points = on_ground(row, middles, terrain)
         spots += [(name, i, vine + 1, shapely.Point(point)) for vine, point in zip(gone, points, strict=True)]
-        bare = np.flatnonzero(np.diff(np.pad(stations.half_width[own] <= 0, 1).astype(int))).reshape(-1, 2)
+        curtains = stations.half_width[own].reshape(1 if vineyard.curtains is None else 2, -1)
+        bare = np.flatnonzero(np.diff(np.pad(curtains[0] <= 0, 1).astype(int))).reshape(-1, 2)
         for start, end in bare * stations.step[own][0]:
             piece = on_ground(row, np.linspace(start, end, math.ceil((end - start) / 0.25) + 1), terrain)
             missing = np.count_nonzero((middles > start) & (middles < end))
