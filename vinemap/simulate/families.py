@@ -10,12 +10,13 @@ import shapely
 from scipy.interpolate import PchipInterpolator
 from shapely.ops import substring
 
+from vinemap.simulate.matching import Matching
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle, Sheet
 from vinemap.simulate.scenes import rows_in, rows_of
 from vinemap.simulate.survey import Survey, simulate
 from vinemap.simulate.terrain import PLACE, hillside, terraced
-from vinemap.simulate.yard import hall, pallets, parked, place, posts, wall
+from vinemap.simulate.yard import place, posts, yard
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -221,6 +222,33 @@ def _net(rng: np.random.Generator) -> Survey:
     return _survey(rng, rows, sheets=[net], obstacles=posts(rows, top=net.height))
 
 
+def _matched(rng: np.random.Generator, *, gaps: bool = False) -> Survey:
+    """A good flight whose photographs are matched; with gaps, rows of which half is left, bare side by side too."""
+    azimuth, sun = rng.uniform(0, 180), rng.uniform(0, 360)
+    rows = _block(rng, n=9, azimuth=azimuth, spacing=rng.uniform(2.2, 2.6), length=rng.uniform(34, 40))
+    flight = Matching(sun, rng.uniform(40, 60), pull=rng.uniform(0.0, 0.01), matched=rng.uniform(0.7, 0.85))
+    vines: dict[str, Any] = {}
+    if gaps:
+        bare = shapely.LineString([place(PLACE, azimuth, 0, across) for across in rng.choice([-1, 1]) * (-3, 15)])
+        vines = {"bare": bare.buffer(rng.uniform(2, 3)), "gaps": rng.integers(3, 9, 2 * len(rows))}
+    return _survey(rng, rows, canopy=vines, obstacles=posts(rows), sensor=flight, density=500.0, noise=0.012)
+
+
+def _matched_poorly(rng: np.random.Generator) -> Survey:
+    """A cheap flight in the wind: large pixels, low sun, long shade."""
+    rows = _block(rng, n=8, length=rng.uniform(30, 40))
+    flight = Matching(
+        rng.uniform(0, 360),
+        rng.uniform(28, 40),
+        clump=rng.uniform(0.28, 0.38),
+        depth=rng.uniform(0.06, 0.08),
+        pull=rng.uniform(0.01, 0.04),
+        matched=rng.uniform(0.55, 0.7),
+        shade=rng.uniform(0.05, 0.09),
+    )
+    return _survey(rng, rows, obstacles=posts(rows), sensor=flight, density=500.0, noise=0.015)
+
+
 def _estate(rng: np.random.Generator) -> Survey:
     """Blocks of two directions at a track, two more across a road, some rows wide, some young; a yard and a hedge."""
     azimuth, track, road = rng.uniform(0, 180), rng.uniform(3, 5), rng.uniform(5, 7)
@@ -254,21 +282,14 @@ def _estate(rng: np.random.Generator) -> Survey:
         PLANTED_THIS_YEAR | {"height": rng.uniform(0.6, 1.0)},
     ]
     blocks = [main[:5], main[5:9], main[9:], other, old, young]
-    cars = parked(at(east, -11.5), n=int(rng.integers(4, 7)), apart=rng.uniform(2.4, 2.9), azimuth=azimuth, rng=rng)
-    n, apart = int(rng.integers(3, 6)), rng.uniform(1.3, 2.5)
-    stacks = pallets(at(east - 2, -15), n=n, apart=apart, azimuth=azimuth, rng=rng)
-    yard = [
-        hall(at(east + 9, -18.5), half_length=rng.uniform(5, 7), half_width=rng.uniform(2, 3), azimuth=azimuth),
-        wall(at(end + 2, -3), length=20, top=rng.uniform(1.2, 2), azimuth=azimuth + 90),
-        *[Obstacle(*at(u, north + 4), 1.8, 1.6, 4.5, bottom=0.9) for u in rng.uniform(-half, east, 3)],
-    ]
-    hedge = Vineyard(
-        "", [row(-north - rng.uniform(2.5, 4), -half, half)], rng.uniform(1.2, 2), rng.uniform(0.5, 0.8), bottom=0.0
-    )
+    trees = [Obstacle(*at(u, north + 4), 1.8, 1.6, 4.5, bottom=0.9) for u in rng.uniform(-half, east, 3)]
+    border = row(-north - rng.uniform(2.5, 4), -half, half)
+    hedge = Vineyard("", [border], rng.uniform(1.2, 2), rng.uniform(0.5, 0.8), bottom=0.0)
     trellis = posts([line for block in blocks for line in block])
-    about: dict[str, Any] = {"obstacles": [*cars, *stacks, *yard, *trellis], "beside": [hedge], "surroundings": 7.0}
-    about |= {"density": 200.0, "density_outside": 150.0}
-    return _survey(rng, *blocks, canopy=canopies, slope=rng.uniform(0.02, 0.1), ragged=0.8, **about)
+    stand = [*yard(at(east, -11.5), azimuth, rng), *trees, *trellis]
+    seen: dict[str, Any] = {"density": 200.0, "density_outside": 150.0, "surroundings": 7.0}
+    slope = rng.uniform(0.02, 0.1)
+    return _survey(rng, *blocks, canopy=canopies, obstacles=stand, beside=[hedge], slope=slope, ragged=0.8, **seen)
 
 
 CLOSE_PLANTED = {"height": 1.15, "half_width": 0.17, "bottom": 0.35}
@@ -311,6 +332,9 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     ),
     "sprawl": _sprawl,
     "net": _net,
+    "matched": _matched,
+    "matched-gaps": lambda rng: _matched(rng, gaps=True),
+    "matched-poorly": _matched_poorly,
 }
 """Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
 dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""

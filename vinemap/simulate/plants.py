@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 from scipy.ndimage import gaussian_filter1d
 
 from vinemap.simulate.terrain import Array, Terrain, waves
@@ -14,7 +15,6 @@ from vinemap.simulate.terrain import Array, Terrain, waves
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import shapely
     from numpy.typing import NDArray
 
 STATION = 0.1  # spacing of canopy stations along a row (m)
@@ -45,6 +45,8 @@ class Vineyard:
     """Share of single dead vines."""
     gaps: Sequence[int] = ()
     """Runs of so many dead vines, dealt to rows at random."""
+    bare: shapely.Polygon | None = None
+    """Where all vines are dead but the rows' first and last."""
     outline: shapely.Polygon | None = None
     """Polygon of the parcel; by default 3 m about the hull of the rows. A parcel without rows needs one."""
 
@@ -102,7 +104,9 @@ def dead_vines_of(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[
         i = order[k % len(order)]
         start = rng.integers(1, max(counts[i] - run, 2))
         dead[i][start : start + run] = True
-    for vines in dead:
+    for row, vines in zip(vineyard.rows, dead, strict=True):
+        if vineyard.bare:
+            vines[shapely.contains_xy(vineyard.bare, at(row, vines_along(vineyard, reached(row)[-1])))] = True
         vines[[0, -1]] = False
     return dead
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 
 from vinemap.simulate.plants import EDGE, LAYERS, Stations, bulge
 from vinemap.simulate.terrain import waves
@@ -20,7 +21,40 @@ if TYPE_CHECKING:
     from vinemap.simulate.terrain import Array, Terrain
 
 STEPS = 14  # steps of a ray through a canopy
+CELL = 0.25  # cells in which rays are dealt out (m)
 TAN_WIDEST = math.tan(math.radians(35))
+
+
+class Cells(NamedTuple):
+    """Cells of :data:`CELL` m over a survey, row by row from its south-western corner."""
+
+    corner: Array
+    shape: tuple[int, int]
+    """Cells from west to east, and from south to north."""
+    centres: Array
+    """(n, 2), m."""
+    distance: Array
+    """Metres (n,) to the nearest station of foliage."""
+    nearest: NDArray[np.intp]
+    """That station (n,); one past the last where none is near."""
+
+    def of(self, xy: Array) -> NDArray[np.intp]:
+        """Cell (m,) of points; of those outside, the outermost."""
+        i, j = np.clip(((xy - self.corner) / CELL).astype(int), 0, np.subtract(self.shape, 1)).T
+        return np.asarray(j * self.shape[0] + i)
+
+    def station_at(self, xy: Array) -> NDArray[np.intp]:
+        """Station (m,) nearest to the cell of points."""
+        return np.asarray(self.nearest[self.of(xy)])
+
+
+def cells_over(outline: shapely.Polygon, stations: Stations) -> Cells:
+    """Cells of an outline's bounds, each with the station of foliage that is nearest, within 2 m."""
+    corner = np.floor(np.array(outline.bounds[:2]))
+    nx, ny = np.ceil((np.array(outline.bounds[2:]) - corner) / CELL).astype(int) + 1
+    centres = (np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1).reshape(-1, 2) + 0.5) * CELL + corner
+    distance, nearest = cKDTree(stations.xy).query(centres, distance_upper_bound=2.0)
+    return Cells(corner, (int(nx), int(ny)), centres, distance, nearest)
 
 
 @dataclass(frozen=True)

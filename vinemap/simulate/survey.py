@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
-from scipy.spatial import cKDTree
 
 from vinemap import paths
+from vinemap.simulate.matching import Matching, matcher
 from vinemap.simulate.plants import Foliage, Vineyard, dead_vines_of, foliage_of, grow
-from vinemap.simulate.rays import TAN_WIDEST, Obstacle, Sheet, meet_leaves, meet_things
+from vinemap.simulate.rays import CELL, TAN_WIDEST, Obstacle, Sheet, cells_over, meet_leaves, meet_things
 from vinemap.simulate.terrain import Array, Terrain, waves
 from vinemap.simulate.truth import truth_of
 
@@ -27,11 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import geopandas as gpd
-    from numpy.typing import NDArray
 
 MADE = date(2019, 6, 1)
 """Date that a simulated cloud states, so that the same survey is the same file on any day."""
-CELL = 0.25  # cells in which rays are dealt out (m)
 CHUNK = 1 << 18
 
 
@@ -66,6 +64,7 @@ def simulate(
     obstacles: Sequence[Obstacle] = (),
     sheets: Sequence[Sheet] = (),
     beside: Sequence[Vineyard] = (),
+    sensor: Matching | None = None,
     weeds: float = 0.15,
     noise: float = 0.025,
     bled: float = 0.01,
@@ -89,6 +88,8 @@ def simulate(
         Roofs of leaves, nets.
     beside : sequence of Vineyard
         What grows in rows and is no vine: hedges, strips of a cover crop. It's in none of the tables of truth.
+    sensor : Matching
+        What image matching makes of the rays; by default every ray that meets something gives a point.
     weeds : float
         Height (m) of the weeds, which cover about a quarter of the ground in patches.
     noise : float
@@ -107,40 +108,34 @@ def simulate(
     hulls = shapely.union_all(parcels.geometry.to_numpy())
     outline = hulls.convex_hull.buffer(surroundings)
 
-    corner = np.floor(np.array(outline.bounds[:2]))
-    nx, ny = np.ceil((np.array(outline.bounds[2:]) - corner) / CELL).astype(int) + 1
-    centres = (np.stack(np.meshgrid(np.arange(nx), np.arange(ny)), axis=-1).reshape(-1, 2) + 0.5) * CELL + corner
-    distance, nearest = cKDTree(stations.xy).query(centres, distance_upper_bound=2.0)
+    over = cells_over(outline, stations)
     shapely.prepare([hulls, outline])
-    rate = np.where(shapely.contains_xy(outline, *centres.T), density_outside, 0.0)
-    rate[shapely.contains_xy(hulls, *centres.T)] = density
-    rate *= np.clip(1 + 0.2 * waves(rng, 12.0)(*centres.T), 0.4, 1.6)
-    rays = np.repeat(np.arange(len(centres)), rng.poisson(rate * CELL**2))
-    heading = rng.uniform(0, 2 * np.pi) + 0.8 * waves(rng, 35.0)(*centres.T)
-    tufts = weeds * np.clip(waves(rng, 7.0)(*centres.T) - 0.6, 0, 0.8) / 0.8
-    line = np.cumsum(np.diff(stations.arc, prepend=np.inf) < 0)  # distances begin anew at each
-    line_at = np.append(line, 0)  # a cell with no row near names the station past the last
-    hidden = 0.65 * (distance < np.append(stations.half_width, -1.0)[nearest])
-
-    def nearest_at(xy: Array) -> NDArray[np.intp]:
-        i, j = np.clip(((xy - corner) / CELL).astype(int), 0, [nx - 1, ny - 1]).T
-        return np.asarray(nearest[j * nx + i])
+    rate = np.where(shapely.contains_xy(outline, *over.centres.T), density_outside, 0.0)
+    rate[shapely.contains_xy(hulls, *over.centres.T)] = density
+    rate *= np.clip(1 + 0.2 * waves(rng, 12.0)(*over.centres.T), 0.4, 1.6)
+    rays = np.repeat(np.arange(len(over.centres)), rng.poisson(rate * CELL**2))
+    heading = rng.uniform(0, 2 * np.pi) + 0.8 * waves(rng, 35.0)(*over.centres.T)
+    tufts = weeds * np.clip(waves(rng, 7.0)(*over.centres.T) - 0.6, 0, 0.8) / 0.8
+    # Distances begin anew at each curtain; a cell with none near names the station past the last.
+    curtain = np.append(np.cumsum(np.diff(stations.arc, prepend=np.inf) < 0), 0)
+    hidden = 0.65 * (over.distance < np.append(stations.half_width, -1.0)[over.nearest])
+    spoil = matcher(sensor, stations, over, rng) if sensor else None
 
     clouds = []
     for cells in np.array_split(rays, len(rays) // CHUNK + 1):
         n = len(cells)
-        xy = centres[cells] + rng.uniform(-CELL / 2, CELL / 2, (n, 2))
+        xy = over.centres[cells] + rng.uniform(-CELL / 2, CELL / 2, (n, 2))
         aim = np.column_stack([xy, terrain(*xy.T)])
-        # Three quarters of the views come from one side, so the other side of a canopy is seen less.
-        toward = heading[cells] + rng.normal(0, 0.9, n) + np.pi * (rng.random(n) < 0.25)
+        # Most views come from one side, so the other side of a canopy is seen less.
+        toward = heading[cells] + rng.normal(0, 0.9, n) + np.pi * (rng.random(n) < (0.4 if sensor else 0.25))
         lean = (TAN_WIDEST * rng.random(n) ** 0.7)[:, None] * np.column_stack([np.cos(toward), np.sin(toward)])
 
         # A leaning ray may pass one row high up and its neighbour low down.
-        upper, lower = nearest_at(xy + 1.6 * lean), nearest_at(xy + 0.5 * lean)
+        upper, lower = over.station_at(xy + 1.6 * lean), over.station_at(xy + 0.5 * lean)
         rise = meet_leaves((aim, lean), upper, 1.6, stations, rng)
-        two = np.flatnonzero(line_at[upper] != line_at[lower])
+        two = np.flatnonzero(curtain[upper] != curtain[lower])
         rise[two] = np.maximum(rise[two], meet_leaves((aim[two], lean[two]), lower[two], 0.5, stations, rng))
-        southings = centres[cells, 1]  # cells come from south to north
+        southings = over.centres[cells, 1]  # cells come from south to north
         rise = np.maximum(rise, meet_things((aim, lean), southings, obstacles, sheets, terrain, rng))
 
         leaf = rise > 0
@@ -154,7 +149,11 @@ def simulate(
         points[:, 2] += np.where(leaf, 0, tufts[cells] * rng.random(n))
         flyers = np.flatnonzero(rng.random(n) < floaters)
         points[flyers, 2] += rng.choice([-1, 1], len(flyers)) * rng.uniform(0.5, 8.0, len(flyers))
-        clouds.append(points[leaf | (rng.random(n) >= hidden[cells])])
+        found = leaf | (rng.random(n) >= hidden[cells])
+        if spoil:
+            points, matched = spoil(points, aim[:, 2], leaf)
+            found &= matched
+        clouds.append(points[found])
     foliage = foliage_of(stations, len(rows))
     return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain, foliage)
 

@@ -36,29 +36,23 @@ def posts(rows: Sequence[Array], *, every: float = 5.0, top: float = 2.0, beyond
     return [Obstacle(x, y, 0.04, 0.04, top, solid=True) for x, y in spots]
 
 
-def parked(first: Spot, *, n: int, apart: float, azimuth: float, rng: np.random.Generator) -> list[Obstacle]:
-    """Cars side by side, from the first towards an azimuth: bonnets and cabins."""
+def yard(at: Spot, azimuth: float, rng: np.random.Generator) -> list[Obstacle]:
+    """Parked cars from a spot towards an azimuth, to their right stacks of pallets and a hall, at the end a wall."""
     out = []
-    for k in range(n):
+    apart = rng.uniform(2.4, 2.9)
+    for k in range(rng.integers(4, 7)):
         height, half_length, askew = rng.uniform(1.4, 1.9), rng.uniform(1.9, 2.3), azimuth + 90 + rng.normal(0, 2)
-        x, y = place(first, azimuth, k * apart, rng.normal(0, 0.2))
+        x, y = place(at, azimuth, k * apart, rng.normal(0, 0.2))
         out.append(Obstacle(x, y, half_length, 0.87, 0.6 * height, bottom=0.2, solid=True, azimuth=askew))
         x, y = place((x, y), askew, -0.15 * half_length, 0.0)
         out.append(Obstacle(x, y, 0.6 * half_length, 0.8, height, bottom=0.2, solid=True, azimuth=askew))
-    return out
-
-
-def pallets(first: Spot, *, n: int, apart: float, azimuth: float, rng: np.random.Generator) -> list[Obstacle]:
-    """Stacks of pallets or crates in a row, some higher than others."""
-    spots = [place(first, azimuth, k * apart, rng.normal(0, 0.1)) for k in range(n)]
-    return [Obstacle(*spot, 0.6, 0.5, rng.uniform(0.6, 2.0), solid=True, azimuth=azimuth) for spot in spots]
-
-
-def hall(centre: Spot, *, half_length: float, half_width: float, azimuth: float) -> Obstacle:
-    """A hall with a ridged roof, eaves at 2.6 m."""
-    return Obstacle(*centre, half_length, half_width, 2.6 + half_width / 2, solid=True, azimuth=azimuth, eaves=2.6)
-
-
-def wall(centre: Spot, *, length: float, top: float, azimuth: float) -> Obstacle:
-    """A wall 0.3 m thick."""
-    return Obstacle(*centre, length / 2, 0.15, top, solid=True, azimuth=azimuth)
+    apart = rng.uniform(1.3, 2.5)
+    for k in range(rng.integers(3, 6)):
+        x, y = place(at, azimuth, k * apart - 2, rng.normal(-3.5, 0.1))
+        out.append(Obstacle(x, y, 0.6, 0.5, rng.uniform(0.6, 2.0), solid=True, azimuth=azimuth))
+    half_length, half_width, eaves = rng.uniform(5, 7), rng.uniform(2, 3), 2.6
+    x, y = place(at, azimuth, 9, -7)
+    top = eaves + half_width / 2
+    out.append(Obstacle(x, y, half_length, half_width, top, solid=True, azimuth=azimuth, eaves=eaves))
+    x, y = place(at, azimuth, 16, 8.5)
+    return [*out, Obstacle(x, y, 10, 0.15, rng.uniform(1.2, 2), solid=True, azimuth=azimuth + 90)]
