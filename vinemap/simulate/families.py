@@ -335,6 +335,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Survey]] = {
     "matched": _matched,
     "matched-gaps": lambda rng: _matched(rng, gaps=True),
     "matched-poorly": _matched_poorly,
+    "lidar": lambda rng: _survey(rng, _block(rng), weeds=0.1, density=rng.uniform(8, 14), density_outside=10.0),
 }
 """Kinds of vineyards, none kinder than a real one: curved at 40 m radius, gaps of 8 vines and of 15 m, 40% of the vines
-dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track, …"""
+dead, terraces at 45% and 1.8 m apart, weeds to 0.5 m, 60–150 points a square metre, two blocks divided by a track,
+bush vines in a square, a closed roof, canopies of 0.2 to 2.4 m, photographs that are matched poorly, …"""
