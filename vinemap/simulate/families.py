@@ -229,7 +229,8 @@ def _matched(rng: np.random.Generator, *, gaps: bool = False) -> Survey:
     flight = Matching(sun, rng.uniform(40, 60), pull=rng.uniform(0.0, 0.01), matched=rng.uniform(0.7, 0.85))
     vines: dict[str, Any] = {}
     if gaps:
-        bare = shapely.LineString([place(PLACE, azimuth, 0, across) for across in rng.choice([-1, 1]) * (-3, 15)])
+        across = rng.choice([-1, 1]) * np.array([-rng.uniform(4, 10), 15.0])
+        bare = shapely.LineString([place(PLACE, azimuth, 0, end) for end in across])
         vines = {"bare": bare.buffer(rng.uniform(2, 3)), "gaps": rng.integers(3, 9, 2 * len(rows))}
     return _survey(rng, rows, canopy=vines, obstacles=posts(rows), sensor=flight, density=500.0, noise=0.012)
 
