@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
+from vinemap.geo.raster import Raster, grid_over
 from vinemap.rows.clusters import cluster_rows, ellipse_graph
 
 
@@ -155,6 +156,27 @@ def test_rows_that_touch_where_blocks_abut_are_torn():
     assert_rows_are_kept_apart(cluster_rows(key_points([*west, *east], spacing=2)), 20)
     kinked = [np.array([[-30, 2 * k], [0, 2 * k], [0, 2 * k] + 25 * along]) for k in range(10)]
     assert_rows_are_kept_apart(cluster_rows(key_points(kinked, spacing=2)), 10)
+
+
+def test_posts_tell_a_gap_of_all_rows_from_a_track():
+    """All ten rows lack 5 m; posts stand there in some of them, or weeds anywhere."""
+    rows = [np.array([[0, 2.5 * k], [40, 2.5 * k]]) for k in range(10)]
+    points = key_points(rows)
+    points = points[~points.geometry.x.between(17, 22)].reset_index(drop=True)
+    grid = grid_over([-2, -2], [42, 25], resolution=0.1)
+    x, y = np.meshgrid(*grid.centres())
+
+    def spots(places):
+        values = np.zeros(grid.shape)
+        for px, py in places:
+            values[np.hypot(x - px, y - py) < 0.15] = 0.6
+        return Raster(values, grid, points.crs)
+
+    posts = spots([(19.3, 2.5), (19.6, 12.5), (19.5, 20.0)])
+    assert_rows_are_kept_apart(cluster_rows(points, posts), 10)
+    weeds = spots([(19.3, 2.5), (19.3, 3.6), (19.6, 12.5), (19.5, 11.4)])
+    assert cluster_rows(points, weeds)["cluster"].nunique() == 20
+    assert cluster_rows(points)["cluster"].nunique() == 20
 
 
 def test_straight_rows_are_not_joined_by_a_bend():

@@ -15,17 +15,19 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.rows.joins import candidates, ends_of, join, over_track_or_headland, torn
+from vinemap.rows.joins import candidates, ends_of, join, over_track_or_headland, torn, with_posts
 
 if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
     from vinemap.compute.arrays import Ints, Values
+    from vinemap.geo.raster import Raster
 
 
 def cluster_rows(
     key_points: gpd.GeoDataFrame,
+    cover: Raster | None = None,
     *,
     method: str = "pieces",
     along: float = 1.0,
@@ -40,6 +42,8 @@ def cluster_rows(
     ----------
     key_points : GeoDataFrame
         Points with ``direction_deg`` and ``spacing_m``.
+    cover : Raster, optional
+        Canopy cover 0–1, in which posts show that rows go on where all of them lack vines.
     method : str
         "pieces" as described above; "ellipse" is the thesis's, for comparison: semi-axes of √(3 d) and √(0.5 d)
         metres (Eq. 4) and nothing joined.
@@ -75,7 +79,10 @@ def cluster_rows(
     pieces, position = torn(xy[kept], spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
     pairs = candidates(ends, max_gap)
-    pairs = pairs[~over_track_or_headland(ends, pairs, xy[kept], track_width)]
+    over = over_track_or_headland(ends, pairs, xy[kept], track_width)
+    if cover is not None:
+        over[over] = ~with_posts(ends, pairs[over], cover)
+    pairs = pairs[~over]
     return out.assign(cluster=join(pairs, len(ends.spacing))[pieces])
 
 

@@ -9,8 +9,11 @@ from scipy.ndimage import label
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
+from vinemap.geo.raster import sample_across
+
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.geo.raster import Raster
 
 TANGENT_LENGTH = 5.0
 """Metres of a piece's end that tell its tangent."""
@@ -34,6 +37,11 @@ BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
 """Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 MARGIN = 0.5
 """Spacings by which a row must be crossed."""
+POST, THICK, SPOTS, CLEAR = 0.25, 0.6, 0.15, 1.2
+"""Cover of a post between two rows' ends, metres that one takes at the most, share of the way that several do, and
+metres from an end within which one is the row's last."""
+POSTED = 0.25
+"""Share of the gaps side by side with posts in them from which it is no track."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -156,6 +164,32 @@ def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: flo
         if sum(map(len, sides)) > 1:
             open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
             out[k] = all((side <= far).all() for side, far in zip(sides, open_to, strict=True))
+    return out
+
+
+def with_posts(ends: Ends, pairs: Ints, cover: Raster) -> Flags:
+    """Whether posts stand in a gap between two ends (k, 2), or in several beside it: there rows go on without vines.
+
+    A post is a spot of canopy in line with the ends, with less half a spacing beside them.
+    """
+    a, b = ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]]
+    spacing = ends.spacing[pairs].mean(axis=1)
+    length = np.hypot(*(b - a).T)
+    step = cover.grid.resolution
+    own = np.zeros(len(pairs), dtype=bool)
+    for k in np.flatnonzero(length > 2 * CLEAR + STRIDE):
+        along = (b[k] - a[k]) / length[k]
+        line = a[k] + np.arange(CLEAR, length[k] - CLEAR, step)[:, None] * along
+        offsets = np.concatenate([np.linspace(-0.1, 0.1, 3), np.linspace(-0.5, -0.3, 3), np.linspace(0.3, 0.5, 3)])
+        normal = np.broadcast_to([-along[1], along[0]], line.shape)
+        seen = sample_across(cover, line, normal, offsets * spacing[k])
+        on, beside = seen[:, :3].max(axis=1), seen[:, 3:].max()
+        own[k] = on.max() > max(POST, 2 * beside) and np.count_nonzero(on > POST / 2) * step < max(THICK, SPOTS * length[k])
+    out = own.copy()
+    middle = (a + b) / 2
+    for k in np.flatnonzero(~own):
+        beside = np.hypot(*(middle - middle[k]).T) <= ACROSS * spacing[k]
+        out[k] = np.count_nonzero(own[beside]) >= max(2, POSTED * np.count_nonzero(beside))
     return out
 
 
