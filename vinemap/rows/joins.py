@@ -184,7 +184,8 @@ def with_posts(ends: Ends, pairs: Ints, cover: Raster) -> Flags:
         normal = np.broadcast_to([-along[1], along[0]], line.shape)
         seen = sample_across(cover, line, normal, offsets * spacing[k])
         on, beside = seen[:, :3].max(axis=1), seen[:, 3:].max()
-        own[k] = on.max() > max(POST, 2 * beside) and np.count_nonzero(on > POST / 2) * step < max(THICK, SPOTS * length[k])
+        thick = np.count_nonzero(on > POST / 2) * step
+        own[k] = on.max() > max(POST, 2 * beside) and thick < max(THICK, SPOTS * length[k])
     out = own.copy()
     middle = (a + b) / 2
     for k in np.flatnonzero(~own):
