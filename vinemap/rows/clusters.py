@@ -66,7 +66,7 @@ def cluster_rows(
     spacing = key_points["spacing_m"].to_numpy()
     thesis = method == "ellipse"
     semi_axes = (np.sqrt(3 * spacing), np.sqrt(0.5 * spacing)) if thesis else (along * spacing, across * spacing)
-    graph = ellipse_graph(xy, direction, along=semi_axes[0], across=semi_axes[1])
+    graph = ellipse_graph(xy, direction, along=semi_axes[0], across=semi_axes[1], mutual=not thesis)
     pieces = _components(graph)
     kept = np.bincount(pieces, minlength=1)[pieces] >= min_points
     out = key_points[kept].reset_index(drop=True)
@@ -86,7 +86,7 @@ def cluster_rows(
     return out.assign(cluster=join(pairs, len(ends.spacing))[pieces])
 
 
-def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values) -> csr_array:
+def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values, mutual: bool = False) -> csr_array:
     """Distances in metres (n, n, sparse) from each point (n, 2) to those in its elliptic region of interest.
 
     Cases A, B and C of the thesis give the points of an ellipse to one cluster and merge the clusters that it
@@ -98,6 +98,8 @@ def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Value
         Points in metres.
     direction, along, across : (n,) array
         Direction of the row at each point in radians, semi-axes of its ellipse in metres (Eq. 4–5).
+    mutual : bool
+        Whether each of two points must lie in the other's ellipse, so that those of another direction don't link rows.
     """
     n = len(xy)
     cell = max(float(along.max(initial=0)), float(across.max(initial=0)), 1e-6)
@@ -107,7 +109,9 @@ def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Value
     order = np.argsort(key, kind="stable")
     first = np.searchsorted(key[order], np.arange((int(column[:, 0].max(initial=0)) + 2) * wide + 1))
     axis = np.column_stack([np.cos(direction), np.sin(direction)])
-    found = in_threads(lambda part: _linked(*part, xy, axis, along, across, key, wide, order, first), stretches(n))
+    found = in_threads(
+        lambda part: _linked(*part, xy, axis, along, across, 1 + mutual, key, wide, order, first), stretches(n)
+    )
     links, others, distance = (np.concatenate(column) for column in zip(*found, strict=True))
     start = np.concatenate([[0], np.cumsum(links)])
     return csr_array((distance, others, start.astype(np.int32)), shape=(n, n))
@@ -121,12 +125,13 @@ def _linked(
     axis: Values,
     along: Values,
     across: Values,
+    least: int,
     key: Ints,
     wide: int,
     order: Ints,
     first: Ints,
 ) -> tuple[Ints, NDArray[np.int32], Values]:
-    """Numbers of points j > i for each point i of which one lies in the other's ellipse, those points, and distances.
+    """Numbers of points j > i for each point i that lie in at least so many of both ellipses, those, and distances.
 
     Points are sorted (``order``) into the cells of a grid ``wide`` columns wide, no smaller than the ellipses; those
     of a cell start at ``first``.
@@ -140,15 +145,16 @@ def _linked(
                 if j <= i:
                     continue
                 x, y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+                inside = 0
                 for p in (i, j):
                     u = x * axis[p, 0] + y * axis[p, 1]
                     v = y * axis[p, 0] - x * axis[p, 1]
-                    if (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1:
-                        links[i - begin] += 1
-                        others.append(np.int32(j))
-                        # A graph's zero is no edge, so that points on one spot need a length.
-                        distances.append(max(np.hypot(x, y), 1e-6))
-                        break
+                    inside += (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1
+                if inside >= least:
+                    links[i - begin] += 1
+                    others.append(np.int32(j))
+                    # A graph's zero is no edge, so that points on one spot need a length.
+                    distances.append(max(np.hypot(x, y), 1e-6))
     return links, np.array(others)[1:], np.array(distances)[1:]
 
 
