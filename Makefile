@@ -17,7 +17,7 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test test-qgis check accuracy odometry bench picture tune web clean
+.PHONY: help parcel survey nightly test test-qgis check accuracy fuzz odometry bench picture tune web clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
@@ -58,6 +58,9 @@ check: $(READY) ## Check style, format and types
 
 accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill docs/accuracy.md: make accuracy [FAMILY="curved fan"]
 	@$(BIN)/python -m vinemap.measure.accuracy $(FAMILY) --out build/accuracy $(if $(FAMILY),,--docs docs/accuracy.md)
+
+fuzz: $(READY) ## Damage small clouds in 2,000 ways: each must end in a right product or in a line: make fuzz [CASES=200]
+	@$(BIN)/python -m vinemap.measure.fuzz $(if $(CASES),--cases $(CASES))
 
 odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=5000]
 	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.measure.odometry $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md

@@ -6,7 +6,7 @@ import pytest
 import shapely
 from pyproj import CRS, Transformer
 
-from vinemap.cloud import las
+from vinemap.cloud import copc, las
 from vinemap.cloud.las import read_cloud
 from vinemap.errors import InputError
 from vinemap.geo.crs import parse_crs
@@ -146,7 +146,7 @@ def test_a_wide_polygon_or_too_many_points_are_read_through(tmp_path, points, qu
     wide = shapely.box(414705, 4940705, 414755, 4940745)
     with pytest.raises(InputError, match="chunk_iterator"):
         queried(path, boundary=(wide, UTM))
-    monkeypatch.setattr(las, "MOST_FOUND", 1000)
+    monkeypatch.setattr(copc, "MOST_FOUND", 1000)
     with pytest.raises(InputError, match="chunk_iterator"):
         queried(path, boundary=(CORNER, UTM))
 

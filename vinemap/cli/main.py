@@ -10,7 +10,7 @@ from vinemap.cli.evaluate import evaluate
 from vinemap.cli.export import export
 from vinemap.cli.run import run
 from vinemap.cli.survey import survey
-from vinemap.cli.terminal import plain_errors
+from vinemap.cli.terminal import hushed, plain_errors
 from vinemap.cli.track import track
 
 
@@ -26,5 +26,5 @@ for command in (run, survey, config, evaluate, export, track):
 
 def main() -> None:
     """Run a command of the command line."""
-    with plain_errors():
+    with hushed(), plain_errors():
         commands.main(prog_name="vinemap", standalone_mode=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
@@ -79,6 +80,32 @@ def plain_errors() -> Iterator[None]:
         if os.environ.get("VINEMAP_TRACEBACK"):
             raise
         _fail(f"{own_fault(error)}; VINEMAP_TRACEBACK=1 shows where", 1)
+
+
+@contextmanager
+def hushed() -> Iterator[None]:
+    """Keep what libraries write on stderr from people, as what matters of it stands in a line of ours.
+
+    Decoders, GDAL and others write there beside Python. With ``VINEMAP_TRACEBACK=1``, or where Python's stderr is no
+    longer the process's, nothing is kept back.
+    """
+    ours = sys.stderr
+    logging.getLogger().addHandler(logging.NullHandler())  # else warnings of theirs go to stderr
+    if os.environ.get("VINEMAP_TRACEBACK") or ours is not sys.__stderr__ or ours is None or ours.fileno() != 2:
+        yield
+        return
+    ours.flush()
+    with (
+        open(os.dup(2), "w", buffering=1, encoding=ours.encoding, errors=ours.errors) as people,  # noqa: PTH123
+        open(os.devnull, "wb") as nobody,  # noqa: PTH123
+    ):
+        os.dup2(nobody.fileno(), 2)
+        sys.stderr = people
+        try:
+            yield
+        finally:
+            sys.stderr = ours
+            os.dup2(people.fileno(), 2)
 
 
 def _stop(number: int, frame: object) -> NoReturn:

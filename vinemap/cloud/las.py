@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from vinemap.cloud.copc import is_copc, points_about
+from vinemap.cloud.las_end import OURS as NOT_THEIRS
+from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
 from vinemap.cloud.zones import deal, zones_of
 from vinemap.compute.threads import ahead
@@ -19,31 +22,39 @@ from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
     from pyproj import CRS
 
+    from vinemap.cloud.copc import Box
+    from vinemap.cloud.layout import Layout
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Floats
 
-    Box = tuple[Floats, Floats]
-
 CHUNK = 500_000
 """Points that are decompressed at once."""
+MOST_BYTES = 256_000_000
+"""Of points that are held at once as they are in the file."""
 SMALL = 0.25
 """Share of a COPC file's extent up to which a query by box is faster than reading it through."""
-MOST_FOUND = 20_000_000
-"""Points of a COPC file's nodes that are held at once, about 2 GB."""
 LARGEST_RELIEF = 2_000.0
 """Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
+WHOLE = 0.01
+"""Steps of the scale by which the box that a header states may miss whole numbers of them."""
+LOOSE = 0.003
+"""Share of its widest side by which points may lie outside of the box that the header states."""
+MOST_OUTSIDE, STRAYS = 0.0001, 3
+"""Share of the points that may lie farther outside, and a number of them that always may."""
 
 DISK = "Failed to use read"
 """What lazrs says of any fault in reading bytes."""
-OURS = (InputError, KeyboardInterrupt, SystemExit, GeneratorExit)
-"""What isn't raised by laspy and lazrs, which raise many kinds: a Rust panic isn't even an Exception."""
+RAN_OUT = "failed to fill whole buffer"
+"""What it says where packed points end too early."""
+OURS = (InputError, MemoryError, *NOT_THEIRS)
+"""What says nothing of a file that laspy and lazrs can't read."""
 
 
 def read_cloud(
@@ -100,9 +111,9 @@ def open_cloud(
     Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
     :func:`read_cloud`.
     """
-    with opened(path, crs=crs) as (reader, source):
+    with opened(path, crs=crs) as (reader, source, layout):
         box = _small_box(reader.header, source, around) if around else None
-        found = _query(path, box) if box else None
+        found = points_about(path, layout, box, _needed()) if box else None
         chunks = _usable_chunks(reader, path, found)
         first = next(chunks, None)
         if first is None and found is not None:
@@ -134,8 +145,8 @@ def date_of(path: Path) -> datetime | None:
 
 
 @contextmanager
-def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS]]:
-    """Open a LAS, LAZ or COPC file: gives laspy's reader, its header checked, and the CRS of its coordinates.
+def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS, Layout]]:
+    """Open a LAS, LAZ or COPC file: gives laspy's reader, the CRS of its coordinates, and its layout, all checked.
 
     Raises
     ------
@@ -147,22 +158,24 @@ def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        reader = laspy.open(path, laz_backend=_backends(path), decompression_selection=_needed())
+        layout = read_layout(path)
+        reader = laspy.open(path, laz_backend=_backends(layout), decompression_selection=_needed())
     except OURS:
         raise
     except BaseException as error:
         raise unreadable(path, error) from error
     with reader:
-        _check_end(reader.header, path)
         source = crs or _stated_crs(reader.header, path)
         _check_header(reader.header, source, path)
-        yield reader, source
+        yield reader, source, layout
 
 
-def _backends(path: Path) -> Any:
+def _backends(layout: Layout) -> Any:
+    """What unpacks a file: on all cores, whole chunks at once, where those fit in memory."""
     import laspy
 
-    return None if path.suffix.lower() == ".las" else [laspy.LazBackend.LazrsParallel, laspy.LazBackend.Lazrs]
+    whole = layout.chunks and layout.widest * layout.head.point_length <= MOST_BYTES
+    return laspy.LazBackend.LazrsParallel if whole else laspy.LazBackend.Lazrs
 
 
 def _needed() -> Any:
@@ -172,16 +185,12 @@ def _needed() -> Any:
     return Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
 
 
-def _check_end(header: Any, path: Path) -> None:
-    if header.number_of_evlrs and header.start_of_first_evlr >= path.stat().st_size:
-        raise InputError(f"{path}: ends before the last records of which its header tells: copy or download it again")
-
-
 def _stated_crs(header: Any, path: Path) -> CRS:
     try:
         stated: CRS | None = header.parse_crs()
     except Exception as error:
-        raise InputError(f"{path}: its CRS can't be understood ({error}): give it with --crs EPSG:n") from error
+        reason = str(error).rpartition("(Internal Proj Error: ")[2][:120].strip(" )")
+        raise InputError(f"{path}: its CRS can't be understood ({reason}): give it with --crs EPSG:n") from error
     if stated is None:
         low, high = header.mins, header.maxs
         degrees = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
@@ -196,6 +205,14 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
     numbers = np.concatenate([header.scales, header.offsets])
     if not np.isfinite(numbers).all() or (header.scales == 0).any():
         raise InputError(f"{path}: scale or offset in its header is no number: write the file again")
+    with np.errstate(all="ignore"):
+        steps = (np.array([header.mins, header.maxs]) - header.offsets) / header.scales
+        odd = (np.abs(steps - np.round(steps)) > WHOLE).any(axis=0)
+    if odd.sum() == 1:  # where the box was not taken of the points, all three are
+        raise InputError(
+            f"{path}: scale, offset and box in its header don't fit each other in {'xyz'[int(odd.argmax())]}, as in "
+            "damaged files: copy or download it again"
+        )
     box = np.concatenate([header.mins[:2], header.maxs[:2]])
     if not np.isfinite(box).all():
         return
@@ -208,10 +225,15 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
 def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Floats]:
     """Coordinates (n, 3) of a file's usable points, or of those found, in its own CRS, chunk by chunk."""
     total, done = reader.header.point_count if found is None else len(found), 0
+    beyond = 0
+    size = max(1, min(CHUNK, MOST_BYTES // reader.header.point_format.size))
+    box = _stated_box(reader.header)
     try:
-        for chunk in reader.chunk_iterator(CHUNK) if found is None else [found]:
+        for chunk in reader.chunk_iterator(size) if found is None else [found]:
             done += len(chunk)
-            xyz = _usable(chunk)
+            xyz = np.column_stack([chunk.x, chunk.y, chunk.z])
+            beyond += _n_outside(xyz, box)
+            xyz = _usable(xyz, chunk)
             if len(xyz):
                 yield xyz
     except OURS:
@@ -220,11 +242,27 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
         raise unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
+    if beyond > max(STRAYS, MOST_OUTSIDE * done):
+        raise InputError(
+            f"{path}: {beyond:,} points lie outside of the box that its header states, as in damaged files: copy or "
+            "download it again, or have its header written anew"
+        )
 
 
-def is_copc(header: Any) -> bool:
-    """Whether a header is that of a COPC file."""
-    return any(record.user_id == "copc" for record in header.vlrs)
+def _stated_box(header: Any) -> Box | None:
+    """Corners (3,) between which a header says that the points lie, with some room; None if it says nothing."""
+    low, high = header.mins, header.maxs
+    if not (np.isfinite([low, high]).all() and (high > low)[:2].all()):
+        return None
+    room = LOOSE * (high - low).max()
+    return low - room, high + room
+
+
+def _n_outside(xyz: Floats, box: Box | None) -> int:
+    """How many points (n, 3) lie outside of a box."""
+    if box is None or len(xyz) == 0 or ((xyz.min(axis=0) >= box[0]) & (xyz.max(axis=0) <= box[1])).all():
+        return 0
+    return int(((xyz < box[0]) | (xyz > box[1])).any(axis=1).sum())
 
 
 def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
@@ -242,27 +280,6 @@ def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
     return np.clip([*low, -np.inf], *limits), np.clip([*high, np.inf], *limits)
 
 
-def _query(path: Path, box: Box) -> Any | None:
-    """Points of a COPC file in a box; None where its index can't be read, lacks points, or has too many there."""
-    from laspy.copc import Bounds, CopcReader, load_octree_for_query
-
-    try:
-        with path.open("rb") as stream:
-            reader = CopcReader(stream, decompression_selection=_needed())
-            index = stream, reader.copc_info, reader.root_page
-            if _size(load_octree_for_query(*index)) != reader.header.point_count:
-                return None
-            bounds = Bounds(*box)
-            few = _size(load_octree_for_query(*index, query_bounds=bounds)) <= MOST_FOUND
-            return reader.query(bounds=bounds) if few else None
-    except Exception:  # noqa: BLE001 - what reading through then says is clearer
-        return None
-
-
-def _size(nodes: Iterable[Any]) -> int:
-    return sum(node.point_count for node in nodes)
-
-
 def _none_inside(path: Path) -> OutsideError:
     return OutsideError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
 
@@ -272,12 +289,13 @@ def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
     reason = str(error).strip().split("\n")[0] or type(error).__name__
     if DISK in reason or (isinstance(error, OSError) and error.errno in PASSING):
         return BusyError(f"{path}: can't be read now ({reason}): try again")
+    if RAN_OUT in reason:
+        reason = "its packed points are damaged"
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
 
 
-def _usable(chunk: Any) -> Floats:
-    """Coordinates (n, 3) of the points of a chunk that aren't flagged as noise and are numbers."""
-    xyz = np.column_stack([chunk.x, chunk.y, chunk.z])
+def _usable(xyz: Floats, chunk: Any) -> Floats:
+    """Coordinates (n, 3) of the points of a chunk that aren't flagged as noise and are numbers, out of all of them."""
     classes = np.asarray(chunk.classification)
     noise = (classes == 7) | (classes == 18) | np.asarray(chunk.withheld, dtype=bool)
     if noise.any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,6 +17,33 @@ COMPRESSED = 0x80
 """Bit of a point format that is LAZ's."""
 LEAST_CHUNK = 20
 """Bytes of points in a chunk of LAZ."""
+OURS = (KeyboardInterrupt, SystemExit, GeneratorExit)
+"""What isn't raised by laspy and lazrs, which raise many kinds: a Rust panic isn't even an Exception."""
+
+
+class Head(NamedTuple):
+    """What the header of a file says of its layout: places and lengths in bytes, and numbers."""
+
+    minor: int
+    """Of its version of LAS, 1.minor."""
+    encoding: int
+    length: int
+    """Of the header."""
+    points_at: int
+    n_records: int
+    kind: int
+    """Point format, with LAZ's bit."""
+    point_length: int
+    n: int
+    """Points."""
+    late_at: int = 0
+    n_late: int = 0
+    """Records behind the points."""
+
+    @property
+    def compressed(self) -> bool:
+        """Whether the points are LAZ."""
+        return bool(self.kind & COMPRESSED)
 
 
 def unfinished(cloud: Path) -> str:
@@ -32,62 +59,95 @@ def unfinished(cloud: Path) -> str:
     """
     size = cloud.stat().st_size
     with cloud.open("rb") as stream:
-        head = stream.read(HEADER)
-        if head[:4] != b"LASF"[: len(head)]:
+        if not begins_as_las(stream):
             return ""  # no such file at all, as reading it will tell
-        if len(head) < OLDEST_HEADER:
-            return "its header isn't whole yet"
-        (offset,), kind, (length, n) = struct.unpack("<I", head[96:100]), head[104], struct.unpack("<HI", head[105:111])
-        if head[25] >= 4 and len(head) == HEADER:
-            at, records, n = struct.unpack("<QIQ", head[235:255])
-            if not _has_records(stream, at, records, size):
-                return "ends before the last of its records"
-        if not kind & COMPRESSED:
-            return "" if size >= offset + n * length else f"ends before the last of its {n:,} points"
-        return "" if _has_table(stream, offset, n, size) else "ends before its table of chunks"
+        head = read_head(stream)
+        if head is None:
+            return "its header isn't whole"
+        if not _has_records(stream, head, size):
+            return "ends before the last of its records"
+        if not head.compressed:
+            whole = size >= head.points_at + head.n * head.point_length
+            return "" if whole else f"ends before the last of its {head.n:,} points"
+        return "ends before its table of chunks" if read_chunks(stream, head, size) is None else ""
 
 
-def _has_records(stream: IO[bytes], at: int, n: int, size: int) -> bool:
-    """Whether n records are there that stand one behind the other, after the points."""
-    for _ in range(n):
+def begins_as_las(stream: IO[bytes]) -> bool:
+    """Whether a file begins as one of LAS, or could if it were longer."""
+    mark = stream.read(4)
+    return mark == b"LASF"[: len(mark)]
+
+
+def read_head(stream: IO[bytes]) -> Head | None:
+    """What a file's header says; None if it isn't there as a whole."""
+    stream.seek(0)
+    head = stream.read(HEADER)
+    if len(head) < (HEADER if head[25:26] >= b"\x04" else OLDEST_HEADER):
+        return None
+    (encoding,) = struct.unpack("<H", head[6:8])
+    length, points_at, n_records, kind, point_length, n = struct.unpack("<HIIBHI", head[94:111])
+    late_at, n_late = 0, 0
+    if head[25] >= 4:
+        late_at, n_late, n = struct.unpack("<QIQ", head[235:255])
+    return Head(head[25], encoding, length, points_at, n_records, kind, point_length, n, late_at, n_late)
+
+
+def _has_records(stream: IO[bytes], head: Head, size: int) -> bool:
+    """Whether the records are there that stand one behind the other, after the points."""
+    at = head.late_at
+    for _ in range(head.n_late):
         if at + LATE_RECORD > size:
             return False
         stream.seek(at)
         at += LATE_RECORD + int.from_bytes(stream.read(LATE_RECORD)[20:28], "little")
-    return n == 0 or at <= size
+    return head.n_late == 0 or at <= size
 
 
-def _has_table(stream: IO[bytes], offset: int, n: int, size: int) -> bool:
-    """Whether the table of chunks of n points in LAZ is there to its end."""
+def read_chunks(stream: IO[bytes], head: Head, size: int) -> list[tuple[int, int]] | None:
+    """Points and bytes of every chunk of LAZ, by the table of chunks; None if that isn't there to its end.
+
+    Where chunks have as many points each, the last is said to have as many, too. How many chunks there are is checked
+    before the table is read: whoever reads it asks for the memory first.
+    """
     import lazrs
 
-    stream.seek(offset)
+    table = chunk_table_at(stream, head, size)
+    if not head.points_at < table <= size - 8:
+        return None
+    stream.seek(table + 4)
+    n_chunks = int.from_bytes(stream.read(4), "little")
+    if (n_chunks == 0) != (head.n == 0) or n_chunks * LEAST_CHUNK > table - head.points_at:
+        return None
+    try:
+        packing = lazrs.LazVlr(packing_of(stream, head.points_at))
+        stream.seek(head.points_at)
+        chunks: list[tuple[int, int]] = lazrs.read_chunk_table(stream, packing)
+    except OURS:
+        raise
+    except BaseException:  # noqa: BLE001 - as said of OURS
+        return None
+    return chunks
+
+
+def chunk_table_at(stream: IO[bytes], head: Head, size: int) -> int:
+    """Where the table of chunks stands."""
+    stream.seek(head.points_at)
     table = _number(stream.read(8))
     if table == -1 and size >= 8:
         stream.seek(-8, os.SEEK_END)
         table = _number(stream.read(8))
-    if not offset < table <= size - 8:
-        return False
-    stream.seek(table + 4)
-    chunks = int.from_bytes(stream.read(4), "little")
-    if (chunks == 0) != (n == 0) or chunks * LEAST_CHUNK > table - offset:
-        return False
-    try:
-        packing = lazrs.LazVlr(_packing(stream, offset))
-        stream.seek(offset)
-        lazrs.read_chunk_table(stream, packing)
-    except lazrs.LazrsError:
-        return False
-    return True
+    return table
 
 
-def _packing(stream: IO[bytes], end: int) -> bytes:
-    """What stands before the points of LAZ about how they are packed."""
+def packing_of(stream: IO[bytes], end: int) -> bytes:
+    """What stands before the points of LAZ about how they are packed; nothing if it isn't there."""
     stream.seek(94)
     at = int.from_bytes(stream.read(2), "little")
     while at < end:
         stream.seek(at)
         record = stream.read(RECORD)
+        if len(record) < RECORD:
+            break
         length = int.from_bytes(record[20:22], "little")
         if record[2:16] == b"laszip encoded":
             return stream.read(length)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.cloud.las import OURS, collected, is_copc, opened, unreadable
+from vinemap.cloud.copc import is_copc
+from vinemap.cloud.las import OURS, collected, opened, unreadable
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
@@ -183,7 +184,7 @@ def ground_pipeline(
 
 def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool]:
     """CRS of a file's coordinates, CRS to work it in, and whether it is a COPC."""
-    with opened(path, crs=crs) as (reader, source):
+    with opened(path, crs=crs) as (reader, source, _):
         try:
             some = reader.read_points(SAMPLE)
         except OURS:
