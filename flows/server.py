@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import runpy
@@ -20,6 +19,8 @@ from http.client import HTTPException
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 from urllib.request import urlopen
+
+from filelock import FileLock, Timeout
 
 from vinemap import paths
 from vinemap.errors import ConfigError, OutputError, VinemapError
@@ -45,14 +46,12 @@ def home() -> Iterator[Path]:
     folder = paths.prefect_home().resolve()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "lock").open("w")
+        held = FileLock(folder / "lock").acquire(timeout=0)
+    except Timeout as error:
+        raise ConfigError(f"{folder}: a schedule is at work here already: stop it first") from error
     except OSError as error:
         raise OutputError(f"{folder}: can't be written ({error.strerror or error})") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ConfigError(f"{folder}: a schedule is at work here already: stop it first") from error
+    with held:
         yield folder
 
 
@@ -144,6 +143,7 @@ def _start(api: str, port: int, folder: Path, log: Path) -> subprocess.Popen[byt
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # the same on Windows
                 env=os.environ | settings,
             )
     except OSError as error:

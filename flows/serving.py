@@ -32,7 +32,7 @@ from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
 
 from flows.server import LOOPBACK, home, server
-from vinemap.compute.processes import descendants
+from vinemap.compute.processes import STOPPING, descendants
 from vinemap.errors import ConfigError, VinemapError
 
 if TYPE_CHECKING:
@@ -115,8 +115,12 @@ async def _serve(deployment: RunnerDeployment, process: Popen[bytes] | None, zon
         tasks = [asyncio.create_task(one) for one in (stopped.wait(), runs.tell(process), runner.start())]
         # The runner begins with a handler of SIGTERM, which ends the process before its runs have.
         await asyncio.sleep(0)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, *STOPPING):
+            try:
+                loop.add_signal_handler(number, stopped.set)
+            except NotImplementedError:  # on Windows
+                signal.signal(number, lambda *_: loop.call_soon_threadsafe(stopped.set))
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         asked = stopped.is_set()
         with suppress(Exception):
@@ -141,7 +145,7 @@ async def _end_runs(process: Popen[bytes] | None, *, patience: float = 10) -> No
                 os.kill(one, number)
         await asyncio.sleep(0.5)
         if time.monotonic() > deadline:
-            number = signal.SIGKILL
+            number = getattr(signal, "SIGKILL", number)
 
 
 class _Runs:

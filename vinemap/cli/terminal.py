@@ -7,10 +7,12 @@ import os
 import signal
 import sys
 from contextlib import contextmanager
+from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
+from vinemap.compute.processes import STOPPING
 from vinemap.errors import VinemapError, own_fault
 
 if TYPE_CHECKING:
@@ -64,8 +66,10 @@ def plain_errors() -> Iterator[None]:
     ``VINEMAP_TRACEBACK=1`` lets a fault through with its traceback. A termination signal unwinds like Ctrl-C, so that
     drafts are removed and servers stopped.
     """
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in STOPPING:
         signal.signal(number, _stop)
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # not all signs are in each code page of Windows
     try:
         yield
     except VinemapError as error:

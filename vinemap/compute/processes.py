@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,13 +19,17 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 
+STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
+"""Signals by which this system asks a process to end, beside Ctrl-C."""
+
+
 class Outcome(NamedTuple):
     """What came of a process."""
 
     code: int
     seconds: float
     peak: int
-    """Most resident memory in bytes."""
+    """Most resident memory in bytes; 0 where the system doesn't tell."""
     said: str
     """The last line of its stderr."""
 
@@ -38,19 +43,28 @@ def run_process(command: Sequence[str], *, limit: float | None = None) -> Outcom
         timer.daemon = True
         timer.start()
         try:
-            _, status, usage = os.wait4(process.pid, 0)
+            peak = _wait(process)
         except BaseException:
             process.kill()
             raise
         finally:
             timer.cancel()
         seconds = time.perf_counter() - began
-        process.returncode = os.waitstatus_to_exitcode(status)
         stderr.seek(0)
         said = stderr.read().decode(errors="replace").strip().split("\n")[-1]
     if limit and seconds >= limit:
         said = f"stopped after {limit:g} s"
-    return Outcome(process.returncode, seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024), said)
+    return Outcome(process.returncode, seconds, peak, said)
+
+
+def _wait(process: subprocess.Popen[bytes]) -> int:
+    """Wait until a process has ended; gives the most memory (bytes) that it held."""
+    if hasattr(os, "wait4"):
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    process.wait()  # on Windows
+    return 0
 
 
 def must(command: Sequence[str]) -> Outcome:
@@ -99,7 +113,7 @@ def resident(process: int) -> int:
     """Memory (bytes) that a process holds; 0 if it has gone."""
     try:
         return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
+    except (OSError, AttributeError):  # on Windows there is neither
         return 0
 
 

@@ -176,12 +176,11 @@ class Worker:
             said = [line for line in self._said.read().splitlines() if line.strip()]
         last = f": {said[-1].decode(errors='replace').strip()[:200]}" if said else ""
         name = f"exit code {code}"
-        if code < 0:
+        if code < 0:  # not on Windows
             with contextlib.suppress(ValueError):
                 name = signal.Signals(-code).name
-                name = f"{name}, {KILLED[name]}" if name in KILLED else name
-        reason = f"its process died ({name}){last}"
-        return _healing(reason) if code == -signal.SIGKILL else WorkerError(reason)
+        reason = f"its process died ({', '.join(filter(None, (name, KILLED.get(name))))}){last}"
+        return _healing(reason) if name == "SIGKILL" else WorkerError(reason)
 
 
 class Workers:

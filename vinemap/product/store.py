@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
+BUSY = {5, 32}
+"""What Windows says where another program has a file open."""
+LONGEST_PATH = 259
+"""Characters of a path that most programs take on Windows."""
+ADDED = 50
+"""Characters that are added to a product's folder while it is made, and to its name in a file's."""
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of Linux's renameat2(2)."""
 PART = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
@@ -115,9 +121,14 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
 
 
 def _check_path(place: Path) -> None:
-    """Refuse a path that pyogrio would cut at its "!", as that of an archive (its issue 632), and write elsewhere."""
+    """Refuse a path that pyogrio would cut at its "!", as that of an archive (its issue 632), or too long a one."""
     if "!" in str(place):
         raise OutputError(f"{place}: has a '!' in its path, which stands for an archive: choose another folder")
+    n = len(str(place)) + len(place.name) + ADDED
+    if os.name == "nt" and n > LONGEST_PATH:
+        raise OutputError(
+            f"{place}: paths of its files would have {n} characters, and Windows takes {LONGEST_PATH}: choose a shorter"
+        )
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -139,6 +150,8 @@ def write_whole(path: Path, text: str) -> None:
 def unwritable(place: Path, error: OSError) -> OutputError:
     """What is said of a folder in which nothing can be written."""
     advice = "make room there" if error.errno in FULL else "choose another folder"
+    if getattr(error, "winerror", None) in BUSY:
+        advice = "close what has its files open, as QGIS may, or choose another folder"
     return OutputError(f"{place}: can't be written ({error.strerror or error}): {advice}")
 
 
@@ -236,7 +249,7 @@ def _keep_others(target: Path, draft: Path) -> None:
 def _link(path: str | Path, kept: str | Path) -> None:
     try:
         os.link(path, kept, follow_symlinks=False)
-    except OSError:
+    except (OSError, NotImplementedError):  # a disk or a system without them
         shutil.copy2(path, kept, follow_symlinks=False)
 
 

@@ -111,8 +111,10 @@ def examine(path: Path, whole: Whole) -> Verdict:
 
     with hushed():
         verdict = _examined(path, whole, step)
-    size = os.fstat(2).st_size
-    return Verdict(NOISE, os.pread(2, size, 0).decode(errors="replace")) if size else verdict
+    if not (size := os.fstat(2).st_size):
+        return verdict
+    os.lseek(2, 0, os.SEEK_SET)
+    return Verdict(NOISE, os.read(2, size).decode(errors="replace"))
 
 
 def _examined(path: Path, whole: Whole, step: Callable[..., Any]) -> Verdict:
