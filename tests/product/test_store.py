@@ -521,3 +521,17 @@ def test_a_text_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
         store.write_whole(path, "new")
     assert path.read_text(encoding="utf-8") == "é"
     assert names(tmp_path) == ["survey.json"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_disk_without_locks_is_one_line(tmp_path, monkeypatch, code):
+    fcntl = pytest.importorskip("fcntl", reason="needs locks as POSIX has them")
+
+    def fail(*args):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    for opened in (store.product(tmp_path / "F"), store.workshop(tmp_path / "survey")):
+        with pytest.raises(OutputError, match=r"its disk has no locks \(.*\): choose a folder on another disk"), opened:
+            pass
+    assert names(tmp_path) == []

@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 import warnings
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -18,12 +19,14 @@ from vinemap.product.layers import LAYERS, Layer, conform
 from vinemap.product.qgis.style import layer_styles
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     import geopandas as gpd
 
 EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
+WITHOUT_LOCKS = {"SQLITE_USE_OGR_VFS": "YES"}
+"""How GDAL writes SQLite's files by itself: nobody else has a draft, and some disks have no locks."""
 SMALLEST = 1 << 20
 """Bytes that a GeoPackage needs: with fewer on the disk, SQLite fails in many ways."""
 
@@ -53,15 +56,29 @@ def write_geopackage(
     OSError
         If it can't be written.
     """
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": f"{date.astimezone(UTC):%Y-%m-%dT%H:%M:%S.000Z}"})
     try:
-        _write_layers(layers, path, contract)
+        with _gdal(OGR_CURRENT_DATE=f"{date.astimezone(UTC):%Y-%m-%dT%H:%M:%S.000Z}", **WITHOUT_LOCKS):
+            _write_layers(layers, path, contract)
     except (DataSourceError, DataLayerError, FeatureError) as error:
         if "full" in str(error) or shutil.disk_usage(path.parent).free < SMALLEST:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
-        raise OSError(f"GeoPackage: {' '.join(str(error).partition(': sqlite3')[0].split())}") from error
+        raise OSError(f"GeoPackage: {_reason(error)}") from error
+
+
+@contextmanager
+def _gdal(**options: str) -> Iterator[None]:
+    """Have GDAL work with some options."""
+    pyogrio.set_gdal_config_options(options)
+    try:
+        yield
     finally:
-        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
+        pyogrio.set_gdal_config_options(dict.fromkeys(options))
+
+
+def _reason(error: Exception) -> str:
+    """What GDAL says, without SQL."""
+    said = " ".join(str(error).partition(": sqlite3")[0].split())
+    return said.rpartition("failed: ")[2][:200]
 
 
 def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path, contract: Mapping[str, Layer]) -> None:
@@ -93,9 +110,10 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     """
     draft = paths.geopackage_draft(path)
     try:
-        pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
+        with _gdal(**WITHOUT_LOCKS):
+            pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
         draft.replace(path)
     except (DataSourceError, DataLayerError, FeatureError, OSError) as error:
-        raise OutputError(f"{path}: can't be written ({' '.join(str(error).split())}): choose another file") from error
+        raise OutputError(f"{path}: can't be written ({_reason(error)}): choose another file") from error
     finally:
         draft.unlink(missing_ok=True)

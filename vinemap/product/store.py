@@ -11,6 +11,7 @@ import shutil
 import sys
 import tempfile
 import uuid
+import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
+LOCKLESS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL}
 BUSY = {5, 32}
 """What Windows says where another program has a file open."""
 LONGEST_PATH = 259
@@ -160,9 +162,18 @@ def _held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
     """Hold a lock, which the system lets go of if this process dies; BusyError says the reason if another has it."""
     holder = FileLock(lock)
     try:
-        holder.acquire(timeout=patience)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that the system's locks are only files
+            holder.acquire(timeout=patience)
     except Timeout as error:
         raise BusyError(reason) from error
+    except OSError as error:
+        if error.errno not in LOCKLESS:
+            raise
+        lock.unlink(missing_ok=True)
+        raise OutputError(
+            f"{lock.parent}: its disk has no locks ({error.strerror}): choose a folder on another disk"
+        ) from error
     try:
         yield
     finally:
