@@ -161,6 +161,83 @@ def test_a_video_with_damage_within_goes_on_behind_it(tmp_path, shots):
     assert len(frames) == 4 * N
 
 
+def jpegs(shots):
+    return [cv2.imencode(".jpg", shot)[1].tobytes() for shot in shots]
+
+
+PART = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n"
+BARE = {
+    "raw": b"".join,
+    "begun within": lambda images: images[0][500:] + b"".join(images),
+    "of a web camera": lambda images: b"".join(PART % (len(image), image) for image in images),
+    "cut": lambda images: b"".join(images)[:-3000],
+}
+
+
+@pytest.mark.parametrize("kind", BARE)
+@pytest.mark.parametrize("name", ["a.mjpeg", "a.mjpg"])
+def test_images_one_behind_the_other_in_a_file(tmp_path, shots, kind, name):
+    (tmp_path / name).write_bytes(BARE[kind](jpegs(shots)))
+    frames, count = read(tmp_path / name)
+    assert count is None
+    assert len(frames) == pytest.approx(N, abs=kind in {"cut", "begun within"})
+    assert {frame.time for frame in frames} == {None}
+    assert np.corrcoef(frames[-2].image.ravel(), shots[len(frames) - 2].ravel())[0, 1] > 0.98
+
+
+def as_live(data):
+    """A WebM as it comes from a stream: of no stated length, without an index."""
+    duration, segment, index = (bytes.fromhex(code) for code in ("448988", "18538067", "1c53bb6b"))
+    at = data.index(duration)
+    data[at : at + 11] = b"\xec\x89" + bytes(9)
+    at = data.index(segment) + 4
+    data[at : at + 8] = b"\x01" + 7 * b"\xff"
+    return data[: data.rindex(index)]
+
+
+def without_index(data):
+    """An AVI whose writer died: it counts no frames, and has no index."""
+    for mark, place in ((b"avih", 24), (b"strh", 40)):
+        at = data.index(mark) + place
+        data[at : at + 4] = bytes(4)
+    return data[: data.rindex(b"idx1")]
+
+
+def of_many(data):
+    """An AVI that says it has four billion frames."""
+    at = data.index(b"strh") + 40
+    data[at : at + 4] = (4_000_000_000).to_bytes(4, "little")
+    return data
+
+
+LIVE = [("a.webm", "VP80", as_live), ("a.avi", "MJPG", without_index), ("a.avi", "MJPG", of_many)]
+
+
+@pytest.mark.parametrize(("name", "codec", "change"), LIVE)
+@pytest.mark.parametrize("kept", [1.0, 0.7])
+def test_a_video_that_does_not_say_how_many_frames_it_has(tmp_path, shots, name, codec, change, kept):
+    path = write_video(tmp_path / name, shots * 3, codec=codec)
+    data = change(bytearray(path.read_bytes()))
+    path.write_bytes(data[: int(kept * len(data))])
+    frames, count = read(path)
+    assert count is None
+    assert len(frames) == pytest.approx(kept * 3 * N, abs=0 if kept == 1 else 2)
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(len(frames)) / 10, abs=1e-3)
+
+
+def test_a_long_hole_in_a_video_does_not_end_it(tmp_path, shots):
+    path = write_video(tmp_path / "a.mp4", shots * 20, codec="mp4v")
+    data = bytearray(path.read_bytes())
+    first, last = len(data) // 8, len(data) * 7 // 8
+    data[first:last] = bytes(last - first)
+    path.write_bytes(data)
+    frames, count = read(path)
+    flaws = "".join("." if frame.flaw else "#" for frame in frames)
+    assert count == len(frames) == 20 * N
+    assert flaws.strip("#").count(".") > 50
+    assert flaws.endswith("#####")
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def frame_progress(frames: Iterable[T], count: int) -> Iterator[T]:
+def frame_progress(frames: Iterable[T], count: int | None) -> Iterator[T]:
     """Give frames on and move a bar, on stderr."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 

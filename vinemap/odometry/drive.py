@@ -68,7 +68,7 @@ def map_drive(
     template_share: float = 0.2,
     angles: tuple[float, float] = ANGLES,
     method: Method = "aligned",
-    show: Callable[[Iterable[Frame], int], Iterable[Frame]] = lambda frames, _: frames,
+    show: Callable[[Iterable[Frame], int | None], Iterable[Frame]] = lambda frames, _: frames,
     step: Callable[..., Any] = lambda _, function, *args: function(*args),
 ) -> DriveSummary:
     """Follow a robot through a recording and write its track.
@@ -86,7 +86,7 @@ def map_drive(
     rows : Path, optional
         Vine rows, for the distance to the nearest one; the track is in their CRS if that is metric. Wants a start.
     show : callable
-        Is given the frames and their number, and gives them on: progress.
+        Is given the frames and their number, where that is known, and gives them on: progress.
     step : callable
         Is given each stage's name of ``STAGES``, its function and that one's arguments, and calls it.
 
@@ -124,7 +124,7 @@ def map_drive(
     return DriveSummary(
         out,
         n_frames=len(fixes),
-        n_missing=max(0, source.n_frames - len(fixes)),
+        n_missing=max(0, (source.n_frames or 0) - len(fixes)),
         flags={flag: flags.count(flag) for flag in set(flags)},
         length_m=float(layers["track"]["length_m"].sum()),
         n_stretches=len(layers["track"]),

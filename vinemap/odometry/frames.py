@@ -35,7 +35,13 @@ AHEAD = 8
 BRIGHTEST = 99.9
 """Percentile of the grey levels that is brought into 8 bits."""
 MISSES = 50
-"""Frames of a video in a row that can't be read before it counts as ended."""
+"""Frames of a video in a row, behind those that it says it has, that can't be read before it counts as ended."""
+LEAST_FRAME = 16
+"""Bytes of a frame: a video that says it has more frames than there is room for says nothing."""
+BARE = {".mjpg", ".mjpeg"}
+"""Videos that may be images alone, one behind the other, without times."""
+CONTAINERS = (b"RIFF", b"ftyp", b"\x1aE\xdf\xa3")
+"""What other files begin with that have such a name."""
 EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
 """Seconds since 1970 in a file's name, with decimals or as milli-, micro- or nanoseconds."""
 CLOCK = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)[T_ -]?([0-2]\d)[:-]?([0-5]\d)[:-]?([0-5]\d)[._,-]?(\d{1,9})?")
@@ -55,10 +61,10 @@ class Frame(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """Frames in order, and how many there should be."""
+    """Frames in order, and how many there should be; None where a live video doesn't say."""
 
     frames: Iterator[Frame]
-    n_frames: int
+    n_frames: int | None
 
 
 def read_recording(paths: Sequence[Path], *, camera: Camera) -> Recording:
@@ -68,7 +74,7 @@ def read_recording(paths: Sequence[Path], *, camera: Camera) -> Recording:
     ----------
     paths : sequence of Path
         Images, folders of images in the order of their names (numbers in them by value), and videos; each goes on
-        where the one before it ended.
+        where the one before it ended. Of videos all frames are read that there are, whatever they say of themselves.
     camera : Camera
         Its distortion is taken out of the frames.
 
@@ -79,8 +85,10 @@ def read_recording(paths: Sequence[Path], *, camera: Camera) -> Recording:
     """
     _quieten()
     parts = [_part(path) for path in paths]
-    count = sum(_length(part) for part in parts)
-    return Recording(_prepared(_one_after_the_other(parts), camera), count)
+    lengths = [_length(part) for part in parts]
+    known = [length for length in lengths if length is not None]
+    count = sum(known) if len(known) == len(lengths) else None
+    return Recording(_prepared(_one_after_the_other(parts, lengths), camera), count)
 
 
 def time_of(name: str) -> float | None:
@@ -132,27 +140,32 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"([0-9]+)", path.name)]
 
 
-def _length(part: list[Path] | Path) -> int:
+def _length(part: list[Path] | Path) -> int | None:
+    """How many frames there should be; None if a video doesn't say, or can't be believed."""
     if isinstance(part, list):
         return len(part)
     import cv2
 
     video = cv2.VideoCapture(str(part))
-    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
-    video.release()
-    if count <= 0:
-        raise InputError(f"{part}: can't be read as a video: was it cut off, or is its codec unknown?")
-    return count
+    try:
+        count = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
+        if 0 < count <= part.stat().st_size / LEAST_FRAME:
+            return int(count)
+        if not any(video.read()[0] for _ in range(MISSES)):
+            raise InputError(f"{part}: can't be read as a video: was it cut off, or is its codec unknown?")
+    finally:
+        video.release()
+    return None
 
 
-def _one_after_the_other(parts: Sequence[list[Path] | Path]) -> Iterator[Frame]:
+def _one_after_the_other(parts: Sequence[list[Path] | Path], lengths: Sequence[int | None]) -> Iterator[Frame]:
     """Frames of all parts; a video's times go on from those of the video before it."""
     begun, last, period = 0.0, 0.0, 0.0
-    for part in parts:
+    for part, length in zip(parts, lengths, strict=True):
         if isinstance(part, list):
             yield from _read_ahead(part)
             continue
-        for frame in _video(part):
+        for frame in _video(part, length or 0):
             time = None if frame.time is None else begun + frame.time
             if time is not None:
                 last, period = time, max(time - last, 0.0)
@@ -205,15 +218,23 @@ def _exif_time(path: Path) -> float | None:
     return time_of(f"{date}.{tags.get('EXIF_SubSecTime_Original', '').strip() or 0}".replace(":", ""))
 
 
-def _video(path: Path) -> Iterator[Frame]:
+def _is_bare(path: Path) -> bool:
+    """Whether a video is images alone, to which decoders make up times."""
+    with path.open("rb") as stream:
+        head = stream.read(12)
+    return path.suffix.lower() in BARE and not any(mark in head for mark in CONTAINERS)
+
+
+def _video(path: Path, length: int) -> Iterator[Frame]:
     """Frames of a video; damaged ones within it are unreadable, those that its end lacks aren't there."""
     import cv2
 
+    bare = _is_bare(path)
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     number, missed = 0, 0
     try:
-        while missed < MISSES:
+        while missed < MISSES or number < length:
             number += 1
             read, image = video.read()
             if not read:
@@ -222,7 +243,7 @@ def _video(path: Path) -> Iterator[Frame]:
             for lost in range(number - missed, number):
                 yield Frame(f"{path.name} {lost}", None, None, "unreadable")
             missed = 0
-            time = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            time = None if bare else video.get(cv2.CAP_PROP_POS_MSEC) / 1000
             yield Frame(f"{path.name} {number}", time, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))  # type: ignore[arg-type]
     finally:
         video.release()
