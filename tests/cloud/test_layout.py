@@ -155,6 +155,12 @@ def test_records_behind_the_points_are_not_trusted(damaged, kind, at, n):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
+def test_an_offset_that_no_place_has(damaged, kind):
+    refused(damaged(kind, (155, "<d", 1e40)), "is no number that a place has")
+    refused(damaged(kind, (155, "<d", 9e8)), "coordinates (9000000")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
 def test_points_outside_of_the_box_that_is_stated(damaged, kind):
     refused(damaged(kind, (179, "<d", 414_725.0)), "points lie outside of the box that its header states")
 

@@ -22,7 +22,7 @@ from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from pyproj import CRS
@@ -42,6 +42,8 @@ LARGEST_RELIEF = 2_000.0
 """Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
+FARTHEST = 1e9
+"""Metres, feet or degrees beyond which no place lies."""
 WHOLE = 0.01
 """Steps of the scale by which the box that a header states may miss whole numbers of them."""
 LOOSE = 0.003
@@ -120,7 +122,10 @@ def open_cloud(
             raise _none_inside(path)
         if first is None:
             raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
-        target = metric_crs(source, *np.median(first[:, :2], axis=0))
+        try:
+            target = metric_crs(source, *np.median(first[:, :2], axis=0))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
         metric = (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
         with ahead(metric) as prepared:
             yield target, vertical_name(source), prepared
@@ -203,8 +208,8 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
     if header.point_count == 0:
         raise InputError(f"{path}: holds no points")
     numbers = np.concatenate([header.scales, header.offsets])
-    if not np.isfinite(numbers).all() or (header.scales == 0).any():
-        raise InputError(f"{path}: scale or offset in its header is no number: write the file again")
+    if not (np.abs(numbers) < FARTHEST).all() or (header.scales == 0).any():
+        raise InputError(f"{path}: scale or offset in its header is no number that a place has: write the file again")
     with np.errstate(all="ignore"):
         steps = (np.array([header.mins, header.maxs]) - header.offsets) / header.scales
         odd = (np.abs(steps - np.round(steps)) > WHOLE).any(axis=0)
@@ -231,9 +236,9 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
     try:
         for chunk in reader.chunk_iterator(size) if found is None else [found]:
             done += len(chunk)
-            xyz = np.column_stack([chunk.x, chunk.y, chunk.z])
-            beyond += _n_outside(xyz, box)
-            xyz = _usable(xyz, chunk)
+            columns = [np.asarray(column) for column in (chunk.x, chunk.y, chunk.z)]
+            beyond += _n_outside(columns, box)
+            xyz = _usable(np.column_stack(columns), chunk)
             if len(xyz):
                 yield xyz
     except OURS:
@@ -258,11 +263,12 @@ def _stated_box(header: Any) -> Box | None:
     return low - room, high + room
 
 
-def _n_outside(xyz: Floats, box: Box | None) -> int:
-    """How many points (n, 3) lie outside of a box."""
-    if box is None or len(xyz) == 0 or ((xyz.min(axis=0) >= box[0]) & (xyz.max(axis=0) <= box[1])).all():
+def _n_outside(columns: Sequence[Floats], box: Box | None) -> int:
+    """How many points, of which there are three columns (n,) of coordinates, lie outside of a box."""
+    within = list(zip(columns, *box, strict=True)) if box and len(columns[0]) else []
+    if all(low <= column.min() and column.max() <= high for column, low, high in within):
         return 0
-    return int(((xyz < box[0]) | (xyz > box[1])).any(axis=1).sum())
+    return int(np.any([(column < low) | (column > high) for column, low, high in within], axis=0).sum())
 
 
 def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
