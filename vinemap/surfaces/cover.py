@@ -38,6 +38,8 @@ AROUND = 4.0
 """Metres, about: side of the squares in which the canopies' height is told, from theirs and from those beside them."""
 ABOUT = 6.0
 """Metres about rows that touch in which they are told by where they stand apart."""
+LOWER = 0.05
+"""Share of a row's points that reach above that level where it is no lower than those that touch."""
 TOP = 0.97
 """Order of a square's heights that is its canopies'."""
 FOOT, LEAST = 0.4, 0.2
@@ -103,7 +105,7 @@ def canopy_cover(
     if touching.any():
         wide = _closed(everything, crown + above, resolution, WIDEST)
         touching &= ~binary_dilation(wide, _disc(WIDEST, _side(resolution)))
-    apart = _about(touching, grid, metres, resolution)
+    apart = _apart(touching, body, crown, grid, metres, resolution)
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = np.where(apart.ravel()[_cells_of(metres, grid)], crown, body) if apart.any() else body
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
@@ -133,14 +135,22 @@ def _canopy_height(chm: Raster, high: float) -> Values:
     return out
 
 
-def _about(blocks: Flags, grid: Grid, metres: Grid, resolution: float) -> Flags:
-    """Cells of 1 m that have some of a mask (of blocks of a grid's cells) in them or thereabouts."""
-    i, j = np.nonzero(blocks)
-    x, y = grid.west + (j + 0.5) * _side(resolution), grid.north - (i + 0.5) * _side(resolution)
+def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Grid, resolution: float) -> Flags:
+    """Cells of 1 m in which rows are told by where they stand apart: where they touch, and about it, so that a row is
+    cut at one level all along; but rows that are lower than those that touch keep theirs."""
     out = np.zeros(metres.ny * metres.nx, dtype=bool)
+    if not touching.any():
+        return out.reshape(metres.shape)
+    i, j = np.nonzero(touching)
+    x, y = grid.west + (j + 0.5) * _side(resolution), grid.north - (i + 0.5) * _side(resolution)
     out[cell_of(np.column_stack([x, y]), metres)] = True
-    around: Flags = binary_dilation(out.reshape(metres.shape), _disc(ABOUT, metres.resolution))
-    return around
+    touch = out.reshape(metres.shape)
+    near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (WIDEST, ABOUT))
+    cells = _cells_of(metres, grid).ravel()
+    plants, high = (np.bincount(cells, layer.ravel(), metres.ny * metres.nx) for layer in (body, crown))
+    lower = (high < LOWER * plants).reshape(metres.shape)
+    held: Flags = near | (about & ~lower)
+    return held
 
 
 def _cells_of(coarse: Grid, fine: Grid) -> Ints:
