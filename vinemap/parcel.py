@@ -162,7 +162,7 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     options["fit"]["high"] = settings.cover.high
     fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
     rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
-    rows, gaps = count_missing(judge_rows(rows), gaps, **options["missing"])
+    rows, gaps = count_missing(judge_rows(rows, cover, chm), gaps, **options["missing"])
     return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 

@@ -1,4 +1,4 @@
-"""Blocks, missing vines, and how sure a row is."""
+"""Blocks and missing vines."""
 
 import geopandas as gpd
 import numpy as np
@@ -6,7 +6,6 @@ import pytest
 import shapely
 
 from vinemap.rows.blocks import group_blocks, outline_blocks
-from vinemap.rows.confidence import judge_rows
 from vinemap.rows.ends import count_missing, estimate_vine_spacing
 
 
@@ -96,20 +95,3 @@ def test_no_order_no_vine_spacing():
     rows = rows_frame(parallel(15, 0, np.array([0, 0])), row_id=np.arange(1, 16))
     assert count_missing(rows, gaps)[0]["vine_spacing_m"].iloc[0] == 1.0
     assert count_missing(rows, gaps, vine_spacing=1.3)[0]["vine_spacing_m"].iloc[0] == 1.3
-
-
-def test_flags_and_confidence():
-    lines = parallel(6, 0, np.array([0, 0]), length=60.0)
-    lines[2] = lines[2] + [0, 1.5]
-    lines[4] = lines[4] * [0.3, 1]
-    t = np.linspace(0, 60, 50)
-    lines[0] = np.column_stack([t, -1.5 * np.sin(np.pi * t / 60)])
-    support = np.array([0.95, 0.95, 0.95, 0.3, 0.95, 0.95])
-    found = judge_rows(rows_frame(lines, block=1, support=support, contrast=1.0))
-    assert [f.split(",") if f else [] for f in found["flags"]] == [
-        ["curved"], [], ["spacing"], ["sparse", "spacing"], ["short"], [],
-    ]  # fmt: skip
-    assert found["confidence"].between(0, 1).all()
-    assert found["confidence"].idxmin() == 3
-    assert found["confidence"].drop(3).min() > 0.9
-    assert judge_rows(rows_frame([], block=1, support=1.0, contrast=1.0)).empty
