@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from vinemap import paths
 from vinemap.canopy.mesh import section_meshes, volume
-from vinemap.canopy.numbers import modelling_indices, summarise_rows
+from vinemap.canopy.numbers import judge_canopies, modelling_indices, summarise_rows
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
@@ -97,6 +97,14 @@ def test_canopies_against_the_true_profile(modelled, shared, name):
     for mine, theirs in (("height_m", "mean_height"), ("width_m", "mean_width")):
         off = rows[mine].to_numpy()[pairs["row_id"] - 1] - truth[theirs].to_numpy()[pairs["reference"] - 1]
         assert np.abs(off).max() <= 0.05
+    assert judge_canopies(rows, model.table, step=0.25)["canopy_confidence"].min() > 0.5
+
+
+def test_canopies_whose_volumes_do_not_follow_truth_are_doubtful(modelled):
+    found, model = modelled("stereo_straight_poor")
+    rows = judge_canopies(summarise_rows(found.rows, model.table, step=0.25), model.table, step=0.25)
+    assert len(rows) == 14
+    assert rows["canopy_confidence"].median() < 0.4
 
 
 def test_canopies_of_a_thinner_cloud(modelled):

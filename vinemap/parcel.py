@@ -14,7 +14,7 @@ from vinemap.canopy.classification import classify_points
 from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.mesh import section_meshes
 from vinemap.canopy.model import CanopyModel, model_sections
-from vinemap.canopy.numbers import summarise_rows
+from vinemap.canopy.numbers import judge_canopies, summarise_rows
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
@@ -256,8 +256,9 @@ def follow(
         rows, gaps = seen.rows, seen.gaps
         model = model_canopies(seen, settings, step=run)
         origin = origin or corner_of(seen.dtm)
+        sized = summarise_rows(rows, model.table, step=settings.sections.step)
         rows, ends, enhanced = describe_rows(
-            summarise_rows(rows, model.table, step=settings.sections.step),
+            judge_canopies(sized, model.table, step=settings.sections.step),
             parcel=parcel,
             origin=origin,
             threshold=settings.curves.threshold,
@@ -345,6 +346,5 @@ def find_canopies(found: RowMap, settings: Settings) -> list[Canopy]:
 
 def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
     """Canopy points of sections that leave nothing between them."""
-    options = settings.sections
-    dense = options.model_copy(update={"step": min(options.step, options.width)})
+    dense = settings.sections.model_copy(update={"step": min(settings.sections.step, settings.sections.width)})
     return [canopy.sections for canopy in find_canopies(found, settings.model_copy(update={"sections": dense}))]

@@ -12,10 +12,11 @@ WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
 
 
-def rows(*confidence):
+def rows(*confidence, canopy=0.9):
     """Rows with these confidences; where they lie doesn't matter."""
     lines = [shapely.LineString([(0, k), (1, k)]) for k in range(len(confidence))]
     numbers = {"confidence": np.array(confidence, dtype=float)}
+    numbers["canopy_confidence"] = canopy
     return gpd.GeoDataFrame(numbers, geometry=lines, crs=32632)
 
 
@@ -111,6 +112,11 @@ def test_how_dense_the_points_are(full):
 def test_rows_that_are_worth_a_look(full):
     said = notices_of(rows(0.1, 0.49, 0.5, 0.9), full, parcel(), int(AREA * 100))
     assert said == ["2 of 4 rows are doubtful (confidence below 0.5)"]
+
+
+def test_canopies_whose_numbers_are_not_to_be_trusted(full):
+    (said,) = notices_of(rows(1, 1, 1, canopy=[0.2, 0.9, np.nan]), full, parcel(), int(AREA * 100))
+    assert said.startswith("heights, widths and volumes of 1 of 3 rows are doubtful")
 
 
 def test_no_points_at_all():

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 import shapely
 
 from vinemap.compute.compiled import compiled
@@ -22,6 +23,16 @@ HECTARE = 10_000.0
 """Square metres."""
 LOW, HIGH, TOP = 0.02, 0.98, 0.985
 """Quantiles of the canopy's points across the row, its sides, and of their heights, its top."""
+CELL = 0.1
+"""Metres of height, on one side of a canopy, that a point shows."""
+SEEN = 0.45, 0.8
+"""Shares of such cells that are shown where a canopy's numbers are to be doubted, and where they aren't."""
+DIFFERENT = 0.25, 0.14
+"""Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
+ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
+"""Ratio of a row's height or width to the median of its block, or its inverse, and deviations from it, that are odd."""
+FEW, NEARBY = 3, 3.0
+"""Rows of a block that can be compared; else those within so many spacings are."""
 
 
 class Measures(NamedTuple):
@@ -42,6 +53,8 @@ class Measures(NamedTuple):
     """G, U and O (m,) of Table 3.1."""
     reduction: Values
     """R (m,) of Table 3.1."""
+    seen: Values
+    """Share (m,) of both sides, from the lowest points up to the height, on which there are points."""
 
 
 def measure_sections(canopy: Sections, bottom: Values, areas: tuple[Values, Values, Values], *, c: int) -> Measures:
@@ -58,11 +71,12 @@ def measure_sections(canopy: Sections, bottom: Values, areas: tuple[Values, Valu
     c : int
         Vertices of a polygon.
     """
-    y = canopy.points[:, 0]
-    width = quantile_of(y, canopy.start, HIGH) - quantile_of(y, canopy.start, LOW)
+    left, right = (quantile_of(canopy.points[:, 0], canopy.start, q) for q in (HIGH, LOW))
     height = quantile_of(canopy.height, canopy.start, TOP)
-    reduction = complexity_reduction(canopy, c=c)
-    return Measures(np.diff(canopy.start), height, bottom, width, areas[2], *modelling_indices(*areas), reduction)
+    indices = *modelling_indices(*areas), complexity_reduction(canopy, c=c)
+    lowest = quantile_of(canopy.height, canopy.start, LOW)
+    seen = _seen(canopy.points, canopy.height, canopy.start, (left + right) / 2, lowest, height)
+    return Measures(np.diff(canopy.start), height, bottom, left - right, areas[2], *indices, seen)
 
 
 def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs: CRS) -> gpd.GeoDataFrame:
@@ -83,9 +97,10 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
         LineStringZ with ``row_id``, ``position_m``, ``height_m`` (98.5% height above ground), ``bottom_m``,
         ``width_m`` (2–98% across), ``area_m2`` (the foliage's), ``n_points``; tree-row volume ``trv_m3_ha`` = height ·
         width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha`` = 2 (height − bottom) · 10,000 / spacing; Table 3.1's
-        indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23).
+        indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``,
+        the share of both sides on which there are points.
     """
-    n_points, height, bottom, width, area, good, under, over, reduction = measures
+    n_points, height, bottom, width, area, good, under, over, reduction, seen = measures
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
     ends = at.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
@@ -106,6 +121,7 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
             "over": over,
             "reduction": reduction,
             "quality": good - (under + over) + reduction,
+            "seen": seen,
         },
         geometry=shapely.linestrings(np.concatenate([ends, level], axis=2)) if len(ends) else [],
         crs=crs,
@@ -148,6 +164,21 @@ def _in_the_one_before(member: NDArray[np.int32], start: Ints, row_id: Ints) -> 
     return out
 
 
+@compiled
+def _seen(points: Values, heights: Values, start: Ints, middle: Values, bottom: Values, top: Values) -> Values:
+    """Share (m,) of cells of height on both sides of sections' middles, from bottom to top, that have points."""
+    out = np.zeros(len(middle))
+    for k in range(len(middle)):
+        n = max(int(np.ceil((top[k] - bottom[k]) / CELL)), 1)
+        shown = np.zeros((2, n))
+        for p in range(start[k], start[k + 1]):
+            i = int((heights[p] - bottom[k]) / CELL)
+            if 0 <= i < n and heights[p] >= bottom[k]:
+                shown[int(points[p, 0] > middle[k]), i] = 1
+        out[k] = shown.mean()
+    return out
+
+
 def quantile_of(values: Values, start: Ints, q: float) -> Values:
     """Quantile (m,) of the values (n,) of each section; 0 where it has none."""
     out = np.zeros(len(start) - 1)
@@ -171,10 +202,98 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     groups = sections.groupby("row_id")
     names = ["height_m", "width_m", "bottom_m", "trv_m3_ha", "lwa_m2_ha"]
     means = groups[names].mean().reindex(rows["row_id"])
+    row = sections["row_id"].to_numpy()
+    volume = (sections["area_m2"] * _lengths(sections, step)).groupby(row).sum().reindex(rows["row_id"])
+    return rows.assign(**{name: means[name].to_numpy() for name in names}, volume_m3=volume.to_numpy())
+
+
+def _lengths(sections: gpd.GeoDataFrame, step: float) -> Values:
+    """Metres of row (m,) for which each section stands."""
     position, row = sections["position_m"].to_numpy(), sections["row_id"].to_numpy()
     away = np.diff(position)
     # Stations of a short row may lie up to half a step further apart; what lies further apart is a gap.
     way = np.where(np.diff(row) == 0, np.where(away <= 1.5 * step, away, step), 0.0)
-    length = (np.concatenate([[0.0], way]) + np.concatenate([way, [0.0]]))[: len(row)] / 2
-    volume = (sections["area_m2"] * length).groupby(row).sum().reindex(rows["row_id"])
-    return rows.assign(**{name: means[name].to_numpy() for name in names}, volume_m3=volume.to_numpy())
+    out: Values = (np.concatenate([[0.0], way]) + np.concatenate([way, [0.0]]))[: len(row)] / 2
+    return out
+
+
+def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
+    """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
+
+    The confidence, from 0 to 1, is the product of three shares: of the row's length without its gaps that has sections;
+    of the canopy that was seen, on both sides from its lowest points to its top; and of the agreement of sections a
+    metre apart in width and area, in which canopies of one row don't differ much. Flagged are heights and widths whose
+    ratio to the median of their block, or of the rows around one that is of no block, is odd, if rows there don't
+    differ anyway.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineString with ``block``, ``spacing_m``, ``gap_m``, ``flags``, ``height_m`` and ``width_m``.
+    sections : GeoDataFrame
+        Sections of these rows.
+    step : float
+        Metres between sections.
+    """
+    row = sections["row_id"].to_numpy()
+    canopy = np.maximum(shapely.length(rows.geometry.to_numpy()) - rows["gap_m"].to_numpy(dtype=float), step)
+    table = pd.DataFrame(
+        {
+            "modelled": pd.Series(_lengths(sections, step)).groupby(row).sum(),
+            "seen": sections.groupby("row_id")["seen"].mean(),
+            "difference": _difference(sections, step=step),
+        }
+    ).reindex(rows["row_id"])
+    confidence = np.minimum(table["modelled"].to_numpy() / canopy, 1) * _between(table["seen"].to_numpy(), SEEN)
+    confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
+    flags = rows["flags"].tolist()
+    groups = _comparable(rows)
+    for name in ("height", "width"):
+        odd = _unlike(rows[f"{name}_m"].to_numpy(dtype=float), groups)
+        flags = [",".join(filter(None, [said, name * flagged])) for said, flagged in zip(flags, odd, strict=True)]
+    return rows.assign(canopy_confidence=confidence, flags=flags)
+
+
+def _between(values: Values, ends: tuple[float, float]) -> Values:
+    """Where values (n,) lie on the way from one end, 0, to the other, 1."""
+    out: Values = np.clip((values - ends[0]) / (ends[1] - ends[0]), 0, 1)
+    return out
+
+
+def _difference(sections: gpd.GeoDataFrame, *, step: float) -> pd.Series:
+    """Median difference of rows' sections a metre apart, of their median, in width or area, whichever is more."""
+    apart = max(1, round(1 / step))
+    row, position = sections["row_id"].to_numpy(), sections["position_m"].to_numpy()
+    pairs = (row[apart:] == row[:-apart]) & (position[apart:] - position[:-apart] < (apart + 1) * step)
+    sizes = sections[["width_m", "area_m2"]].to_numpy(dtype=float)
+    differences = pd.DataFrame(np.abs(sizes[apart:] - sizes[:-apart])[pairs]).groupby(row[apart:][pairs]).median()
+    medians = pd.DataFrame(sizes).groupby(row).median()
+    # A few sections can't be held against each other, which doesn't speak for them.
+    out: pd.Series = (differences / medians).fillna(1.0).max(axis=1)
+    return out
+
+
+def _comparable(rows: gpd.GeoDataFrame) -> list[Ints]:
+    """Positions of the rows with which each is compared, itself among them: its block's, or else the nearest."""
+    block, lines = rows["block"].to_numpy(), shapely.force_2d(rows.geometry.to_numpy())
+    members = {one: np.flatnonzero(block == one) for one in np.unique(block)}
+    tree = shapely.STRtree(lines)
+    reach = NEARBY * rows["spacing_m"].to_numpy(dtype=float)
+    return [
+        own if len(own := members[one]) >= FEW else tree.query(line, predicate="dwithin", distance=far)
+        for one, line, far in zip(block, lines, reach, strict=True)
+    ]
+
+
+def _unlike(sizes: Values, groups: list[Ints]) -> list[bool]:
+    """Whether each size (n,), which may be NaN, is unlike those of its group."""
+    out = []
+    for size, group in zip(sizes, groups, strict=True):
+        known = sizes[group][np.isfinite(sizes[group])]
+        if len(known) < FEW or not np.isfinite(size):
+            out.append(False)
+            continue
+        median = float(np.median(known))
+        usual = 1.4826 * float(np.median(np.abs(known - median)))
+        out.append(bool(abs(np.log(size / median)) > np.log(ODD_SIZE) and abs(size - median) > ODD_DEVIATIONS * usual))
+    return out

@@ -35,12 +35,12 @@ MAIN = 0.1
 def notices(
     rows: gpd.GeoDataFrame, chm: Raster, parcel: gpd.GeoDataFrame, unmapped: gpd.GeoDataFrame, n_points: int
 ) -> list[str]:
-    """Remarks, a sentence each: how far points cover a parcel, how densely, doubtful rows, and what is in no row.
+    """Remarks, a sentence each: how far and how densely points cover a parcel, doubtful rows and canopies, the rest.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineString with ``confidence``.
+        LineString with ``confidence`` and ``canopy_confidence``.
     chm : Raster
         Canopy height, NaN where there are no points.
     parcel : GeoDataFrame
@@ -63,8 +63,15 @@ def notices(
         f"{density:.0f} points/m², canopies are poor below {DENSE:.0f}": density < DENSE,
         f"{doubtful} of {len(rows)} rows are doubtful (confidence below {SURE:g})": doubtful > 0,
     }
-    told = [remark for remark, holds in remarks.items() if holds]
+    told = [remark for remark, holds in remarks.items() if holds] + _doubtful_canopies(rows)
     return told + (_in_no_row(unmapped) if len(rows) else [_why_nothing(unmapped, density)])
+
+
+def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:
+    """That heights, widths and volumes of rows aren't to be trusted, whose canopies weren't seen well."""
+    doubtful = int((rows["canopy_confidence"] < SURE).sum())
+    what = f"heights, widths and volumes of {doubtful} of {len(rows)} rows are doubtful: their canopies were seen too"
+    return [f"{what} sparsely or unevenly (canopy_confidence below {SURE:g})"] if doubtful else []
 
 
 def _in_no_row(unmapped: gpd.GeoDataFrame) -> list[str]:

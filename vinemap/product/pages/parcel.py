@@ -47,12 +47,14 @@ TABLE = {
     **dict.fromkeys(("volume_m3", "gap_m"), 2),
     "n_missing": 0,
     "block": 0,
-    **dict.fromkeys(("support", "confidence"), 3),
+    **dict.fromkeys(("support", "confidence", "canopy_confidence"), 3),
     **dict.fromkeys(("trv_m3_ha", "lwa_m2_ha"), 0),
 }
 """Columns of ``rows`` on the page, and their decimals."""
 UNMAPPED = {"area_m2": 1, "share": 4, "height_m": 1, "width_m": 1}
 """Columns of ``unmapped`` on the page, and their decimals."""
+MEANS = ("height_m", "width_m", "support", "confidence", "canopy_confidence")
+"""Columns of ``rows`` whose mean the page tells."""
 RECORD = (
     "vinemap",
     "survey",
@@ -123,7 +125,7 @@ def parcel_page(
 def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]:
     """Key numbers of a parcel; means are weighted by the length of the rows."""
     length = rows["length_m"].to_numpy(dtype=float)
-    means = {name: _mean(rows[name].to_numpy(dtype=float), length) for name in ("height_m", "width_m", "support")}
+    means = {name: _mean(rows[name].to_numpy(dtype=float), length) for name in MEANS}
     return {
         "rows": len(rows),
         "length_m": float(length.sum()),
@@ -132,7 +134,6 @@ def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]
         "volume_m3": float(rows["volume_m3"].sum()),
         "n_missing": int(rows["n_missing"].sum()),
         "gap_m": float(rows["gap_m"].sum()),
-        "confidence": _mean(rows["confidence"].to_numpy(dtype=float), length),
         **means,
     }
 

@@ -37,6 +37,8 @@ WORDS = {
     "n_points": "Points",
     "n_missing": "Missing vines",
     "support": "Share of the length with canopy",
+    "confidence": "Confidence that it is a row",
+    "canopy_confidence": "Confidence in the canopy's numbers",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
     "share": "Share of the parcel",
@@ -101,7 +103,9 @@ SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000, "poses"
 LABEL_SCALE = 4000
 MAP_TIPS = {
     "rows": "<b>Row [% label %]</b><br>[% round(length_m, 1) %] m, [% round(volume_m3 / length_m, 2) %] m³/m<br>"
-    "[% round(height_m, 2) %] m high, [% round(width_m, 2) %] m wide<br>missing vines: [% n_missing %]",
+    "[% round(height_m, 2) %] m high, [% round(width_m, 2) %] m wide<br>missing vines: [% n_missing %]"
+    "<br>confidence: [% round(confidence, 2) %] in the row[% if(canopy_confidence is null, '', ', ' || "
+    "round(canopy_confidence, 2) || ' in its canopy') %][% if(flags = '', '', '<br>' || flags) %]",
     "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, missing vines: [% n_missing %]",
     "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
     "[% round(width_m, 2) %] m wide",

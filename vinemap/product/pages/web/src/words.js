@@ -28,9 +28,14 @@ export function showHead({ parcel, survey, flown, warnings, totals, vinemap }) {
 
 export function showQuality({ modelling, totals, counts }, rows) {
   const percent = (value, digits = 1) => number(value === null || value === undefined ? null : 100 * value, digits);
-  const doubtful = rows.filter((row) => row.confidence < 0.5).length;
+  const lowest = (name) => {
+    const known = rows.map((row) => row[name]).filter((value) => value !== null);
+    const doubtful = known.filter((value) => value < 0.5).length;
+    return known.length ? (doubtful ? `${doubtful} below 0.5` : `lowest ${number(Math.min(...known), 2)}`) : "";
+  };
   facts(at("quality"), [
-    ["Confidence in rows", number(totals.confidence, 2), "", rows.length ? (doubtful ? `${doubtful} below 0.5` : `lowest ${number(Math.min(...rows.map((row) => row.confidence)), 2)}`) : ""],
+    ["Confidence in rows", number(totals.confidence, 2), "", lowest("confidence")],
+    ["Confidence in canopies", number(totals.canopy_confidence, 2), "", lowest("canopy_confidence")],
     ["Rows with canopy", percent(totals.support), "%", "of their length"],
     ["Well modelled", percent(modelling?.good), "%", "of the outline of the points"],
     ["Under-modelled", percent(modelling?.under), "%", "of that outline left out"],
