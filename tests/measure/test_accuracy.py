@@ -196,7 +196,9 @@ def test_a_table_is_filled_between_its_marks():
 
 
 def test_a_family_is_measured_and_drawn(tmp_path):
-    errors, canopy = measure("short", 1, tmp_path)
+    errors, canopy, trust = measure("short", 1, tmp_path)
+    assert len(trust.right) == errors.found
+    assert trust.right.sum() == len(errors.pairs) == len(trust.volume)
     assert len(canopy.height) == len(errors.pairs)
     assert len(canopy.good) > 200
     assert "–" not in "".join(table({"short": canopy}, CANOPY_COLUMNS)[1])

@@ -2,7 +2,7 @@
 
 Every family of :mod:`vinemap.simulate.families` is simulated with a few seeds and mapped in memory, without a boundary
 and with the settings as they come. What misses its bar is marked with "!". Of the worst row of each family a picture is
-drawn.
+drawn, and one of confidence beside truth.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import click
 
 from vinemap.measure.accuracy.family import measure
 from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, table
+from vinemap.measure.accuracy.trust import draw_trust, pool_trust, trust_table
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.simulate.families import FAMILIES
 
@@ -35,13 +36,18 @@ def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool
     with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool_:
         jobs = {name: pool_.submit(measure, name, seeds, out) for name in names}
         results = {name: job.result() for name, job in jobs.items()}
+    trusted = pool_trust([trust for *_, trust in results.values()])
     tables = {
-        "rows": table({name: rows for name, (rows, _) in results.items()}),
-        "canopies": table({n: c for n, (_, c) in results.items() if len(c.good)}, CANOPY_COLUMNS),
+        "rows": table({name: rows for name, (rows, *_) in results.items()}),
+        "canopies": table({n: c for n, (_, c, _) in results.items() if len(c.good)}, CANOPY_COLUMNS),
+        "confidence": trust_table(trusted),
     }
     for lines in tables.values():
         click.echo((as_markdown if markdown else as_text)(lines) + "\n")
+    if out:
+        draw_trust(trusted, out / "confidence.png")
     if docs:
+        draw_trust(trusted, docs.with_name("confidence.png"))
         text = docs.read_text(encoding="utf-8")
         for name, lines in tables.items():
             text = fill(text, name, as_markdown(lines))
