@@ -16,7 +16,14 @@ def rows_of(heights, widths=0.5, block=1, apart=2.5):
     """Rows side by side; they are as high and as wide as told, NaN where nothing was modelled."""
     n = len(heights)
     lines = [shapely.LineString([(0, apart * k), (LENGTH, apart * k)]) for k in range(n)]
-    table = {"row_id": np.arange(1, n + 1), "block": block, "spacing_m": apart, "gap_m": 0.0, "flags": ""}
+    table = {
+        "row_id": np.arange(1, n + 1),
+        "block": block,
+        "spacing_m": apart,
+        "gap_m": 0.0,
+        "bottom_m": 0.5,
+        "flags": "",
+    }
     return gpd.GeoDataFrame(table | {"height_m": heights, "width_m": widths}, geometry=lines, crs=32632)
 
 
@@ -40,6 +47,8 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
     assert confidence(sections_of(seen=0.55)) == pytest.approx(2 / 7)
     assert confidence(sections_of(width=jagged)) < 0.5
     assert confidence(sections_of(n=3), gap_m=LENGTH - 1) == 0
+    assert confidence(sections_of(width=2.2), width_m=2.2) < 0.6
+    assert confidence(sections_of(width=3.0), width_m=3.0, bottom_m=1.6) == 0
 
 
 def test_without_a_canopy_there_is_neither_confidence_nor_flag():

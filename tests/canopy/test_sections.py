@@ -23,7 +23,7 @@ from vinemap.canopy.numbers import (
     tabulate_sections,
 )
 from vinemap.canopy.peeling import peel_sections
-from vinemap.canopy.points import NO_SECTIONS, Sections, join
+from vinemap.canopy.points import NO_SECTIONS, Sections, canopy_size, join
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import Grid, Raster
@@ -306,3 +306,30 @@ def test_a_row_shorter_than_a_step():
     model = model_sections(separate(sections), UTM)
     assert len(model.table) == 2
     assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("height", "half", "spacing"), [(0.6, 0.1, 2.0), (1.9, 0.25, 2.5), (3.1, 1.1, 4.5), (1.7, 0.8, 1.8)]
+)
+def test_the_size_of_a_row_is_what_holds_its_canopy(height, half, spacing):
+    """Over weeds, and beside a cover crop half as high as tall rows."""
+    rng = np.random.default_rng(0)
+    canopy = np.column_stack([rng.uniform(-half, half, 4000), rng.uniform(0.15 * height, height, 4000)])
+    weeds = np.column_stack([rng.uniform(-spacing / 2, spacing / 2, 4000), rng.uniform(0, 0.15, 4000)])
+    strip = np.column_stack([rng.uniform(0.8, 1.2, 2000), rng.uniform(0, 0.4 * height, 2000)])
+    left, up = np.concatenate([canopy, weeds, strip]).T
+    top, side = canopy_size(left, up, spacing, 3.6)
+    assert top == pytest.approx(height, rel=0.15)
+    assert half <= side <= min(1.5 * half + 0.3, spacing / 2)
+    assert canopy_size(left[:0], up[:0], spacing, 3.6) == (3.6, spacing / 2)
+
+
+def test_low_and_wide_canopies_keep_their_points():
+    rng = np.random.default_rng(0)
+    for height, half, spacing in ((0.55, 0.1, 2.0), (3.1, 1.1, 4.5)):
+        box = np.column_stack([rng.uniform(-half, half, 3000), rng.uniform(0.1 * height, height, 3000)])
+        (canopy,) = separate(many_sections([box] * 3, spacing=spacing))
+        points = canopy.sections.points
+        assert np.abs(points[:, 0]).max() == pytest.approx(half, abs=0.02)
+        assert points[:, 1].max() == pytest.approx(height, abs=0.02)
+        assert len(points) > 0.65 * 9000

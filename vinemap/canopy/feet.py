@@ -44,9 +44,10 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
     above = canopy.points[:, 1] <= np.repeat(foot + FOOT_BAND, np.diff(canopy.start))
     # Points higher up go to a bin of their own, that doesn't count.
-    across = np.where(above, np.clip(canopy.points[:, 0], -1.0, 0.999), 2.0)
-    widths = _pooled(_histograms(across, canopy.start, -1.0, FOOT_BIN, round(2 / FOOT_BIN) + 1)[:, :-1], near)
-    right, left = (_rank(widths, q) * FOOT_BIN - 1.0 for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
+    half = FOOT_BIN * np.ceil(np.abs(canopy.points[:, 0]).max(initial=FOOT_BIN) / FOOT_BIN + 1)
+    across = np.where(above, canopy.points[:, 0], 2 * half)
+    widths = _pooled(_histograms(across, canopy.start, -half, FOOT_BIN, round(2 * half / FOOT_BIN) + 1)[:, :-1], near)
+    right, left = (_rank(widths, q) * FOOT_BIN - half for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
     feet = np.stack([(left + right) / 2, foot, left, foot, right, foot], axis=-1).reshape(m, 3, 2)
     return canopy, feet
 

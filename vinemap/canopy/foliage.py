@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.points import NO_SECTIONS
+from vinemap.canopy.points import NO_SECTIONS, canopy_size
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -20,8 +20,12 @@ BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""
 NOISE_CELL = 0.1
 """Metres: cells of a section in which a point has neighbours or is noise."""
+USUAL_CELLS = 100
+"""Cells of a canopy of usual size; a larger one spreads its points over more."""
 TALL = 0.1
 """Share of a section's canopy that must be high."""
+LOWEST, FOOT, UPPER = 0.15, 0.22, 0.5
+"""Metres and share of a row's height from which its canopy is told from soil, and share from which points are high."""
 GROUND = 0.3
 """Metres above or below the terrain model within which points tell the inter-row's elevation."""
 
@@ -43,7 +47,7 @@ def separate_canopy(
     sections: Sections,
     *,
     margin: float = 0.4,
-    half_width: float = 0.9,
+    half_width: float | None = None,
     max_height: float = 3.6,
     min_neighbours: float = 0.02,
     min_height: float = 0.8,
@@ -57,19 +61,28 @@ def separate_canopy(
     Parameters
     ----------
     sections : Sections
-        All points of every section.
-    margin, half_width, max_height : float
-        Metres above plane and terrain at which canopy begins, to the side of γ at which it ends, and above terrain at
-        which it ends.
+        All points of every section of a row.
+    margin : float
+        Metres above plane and terrain at which canopy begins, or less where the row is low.
+    half_width : float, optional
+        Metres to the side of γ at which canopy ends; by default what holds the row's, half its spacing at the most.
+    max_height : float
+        Metres above terrain at which canopy ends.
     min_neighbours : float
-        Share of a section's canopy points that must lie around a point (in 3 x 3 cells of 0.1 m), or it is noise.
+        Share of a section's canopy points that must lie around a point (in 3 x 3 cells of 0.1 m), or it is noise; less
+        in canopies of more than a square metre.
     min_height : float
-        Metres from which points are high.
+        Metres from which points are high, or less where the row is low.
     """
     m = len(sections.row_id)
+    if m:
+        spacing = float(sections.spacing.max())
+        top, half = canopy_size(sections.points[:, 0], sections.height, spacing, max_height)
+        half_width = half if half_width is None else half_width
+        margin, min_height = min(margin, max(LOWEST, FOOT * top)), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
-    limits = (margin, half_width, max_height, min_neighbours, min_height)
+    limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height)
     in_threads(
         lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, tall),
         stretches(m),
@@ -122,7 +135,7 @@ def _separate(
             kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
         for side in range(2):
             sign = 1 - 2 * side
-            w, h, distance = _plane(y, z, up, kept, sign)
+            w, h, distance = _plane(y, z, up, kept, sign, half_width)
             walls[k, side] = w, h
             slope = h / max(distance, 0.2)
             for p in range(len(y)):
@@ -137,12 +150,12 @@ def _separate(
 
 
 @compiled
-def _plane(y: Values, z: Values, up: Values, canopy: Flags, sign: int) -> tuple[float, float, float]:
+def _plane(y: Values, z: Values, up: Values, canopy: Flags, sign: int, widest: float) -> tuple[float, float, float]:
     """Wall w and elevation h of the inter-row on the side of a sign of y (Eq. 6–9), and the inter-row's distance.
 
     The elevation is that of the inter-row's middle: the plane through it must not be steeper than the ground.
     """
-    walls, levels = np.zeros(round(1 / BIN)), np.zeros(round(3 / BIN))
+    walls, levels = np.zeros(int(widest / BIN) + 1), np.zeros(round(3 / BIN))
     total, leaves = 0.0, 0
     for p in range(len(y)):
         if canopy[p]:
@@ -174,7 +187,10 @@ def _peak(histogram: Values) -> float:
 
 @compiled
 def _drop_noise(y: Values, z: Values, kept: Flags, share: float) -> None:
-    """Unflag points with less than a share of the flagged, or fewer than two others, in the cells around."""
+    """Unflag points with less than a share of the flagged, or fewer than two others, in the cells around.
+
+    Where more than ``USUAL_CELLS`` have points, the share is as much less.
+    """
     n, low, high, west, east = 0, np.inf, -np.inf, np.inf, -np.inf
     for p in range(len(y)):
         if kept[p]:
@@ -187,7 +203,7 @@ def _drop_noise(y: Values, z: Values, kept: Flags, share: float) -> None:
     for p in range(len(y)):
         if kept[p]:
             cells[int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1] += 1
-    least = max(3.0, share * n)
+    least = max(3.0, share * n * min(1.0, USUAL_CELLS / np.count_nonzero(cells)))
     for p in range(len(y)):
         if kept[p]:
             i, j = int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1

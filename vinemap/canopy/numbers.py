@@ -29,6 +29,8 @@ SEEN = 0.45, 0.8
 """Shares of such cells that are shown where a canopy's numbers are to be doubted, and where they aren't."""
 DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
+SPREADING = 2.5, 0.8
+"""Ratios of width to depth of a canopy whose underside was hardly seen, and of one that hides little of it."""
 ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
 """Ratio of a row's height or width to the median of its block, or its inverse, and deviations from it, that are odd."""
 FEW, NEARBY = 3, 3.0
@@ -220,16 +222,17 @@ def _lengths(sections: gpd.GeoDataFrame, step: float) -> Values:
 def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
     """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
 
-    The confidence, from 0 to 1, is the product of three shares: of the row's length without its gaps that has sections;
-    of the canopy that was seen, on both sides from its lowest points to its top; and of the agreement of sections a
-    metre apart in width and area, in which canopies of one row don't differ much. Flagged are heights and widths whose
+    The confidence, from 0 to 1, is the product of four shares: of the row's length without its gaps that has sections;
+    of the canopy that was seen, on both sides from its lowest points to its top; of the underside that isn't hidden,
+    as it is where a canopy is wider than deep; and of the agreement of sections a metre apart in width and area, in
+    which canopies of one row don't differ much. Flagged are heights and widths whose
     ratio to the median of their block, or of the rows around one that is of no block, is odd, if rows there don't
     differ anyway.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineString with ``block``, ``spacing_m``, ``gap_m``, ``flags``, ``height_m`` and ``width_m``.
+        LineString with ``block``, ``spacing_m``, ``gap_m``, ``flags``, ``height_m``, ``bottom_m`` and ``width_m``.
     sections : GeoDataFrame
         Sections of these rows.
     step : float
@@ -246,10 +249,12 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     ).reindex(rows["row_id"])
     confidence = np.minimum(table["modelled"].to_numpy() / canopy, 1) * _between(table["seen"].to_numpy(), SEEN)
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
+    height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
+    confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)
     flags = rows["flags"].tolist()
     groups = _comparable(rows)
-    for name in ("height", "width"):
-        odd = _unlike(rows[f"{name}_m"].to_numpy(dtype=float), groups)
+    for name, sizes in (("height", height), ("width", width)):
+        odd = _unlike(sizes, groups)
         flags = [",".join(filter(None, [said, name * flagged])) for said, flagged in zip(flags, odd, strict=True)]
     return rows.assign(canopy_confidence=confidence, flags=flags)
 

@@ -16,6 +16,15 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Ints, Values
 
+BIN = 0.05
+"""Metres: bins of heights, and across, in which a row's canopy is measured."""
+LEAST, TOP = 0.2, 0.95
+"""Metres above which points may be a canopy's, and the order of their heights that is its height."""
+UPPER, EDGE = 0.5, 0.1
+"""Share of its height above which a canopy's width is told, and share of its density, from its middle, at its sides."""
+WIDER, BESIDE = 1.5, 0.2
+"""By how much, and by how many metres, a canopy may be wider than it is on the whole."""
+
 
 class Sections(NamedTuple):
     """Sections S_k of all rows, ordered by row and position, with their points one after the other.
@@ -115,3 +124,36 @@ def _take_flagged(
                 kept[at, 0], kept[at, 1] = points[p, 0], points[p, 1]  # a row at once would be far slower
                 kept_height[at], kept_member[at] = height[p], member[p]
                 at += 1
+
+
+@compiled
+def canopy_size(left: Values, height: Values, spacing: float, highest: float) -> tuple[float, float]:
+    """Height and half width in metres that hold a row's canopy, on the whole: what lies beyond is not the row's.
+
+    The height is that of most points within a quarter of the spacing; the half width is where those of its upper half,
+    which neither weeds nor a cover crop reach, have thinned out, and half as much again, at the most half the spacing.
+
+    Parameters
+    ----------
+    left, height : (n,) array
+        Points of a row: metres to its left, and above ground.
+    spacing, highest : float
+        Metres to the next row, and of height above which there is no canopy.
+    """
+    levels = np.zeros(int(highest / BIN) + 1)
+    for p in range(len(left)):
+        if LEAST <= height[p] <= highest and abs(left[p]) <= 0.25 * spacing:
+            levels[int(height[p] / BIN)] += 1
+    total = np.cumsum(levels)
+    if total[-1] == 0:
+        return highest, 0.5 * spacing
+    top = BIN * (np.searchsorted(total, TOP * total[-1]) + 1)
+    across = np.zeros(int(0.5 * spacing / BIN) + 3)
+    for p in range(len(left)):
+        if UPPER * top <= height[p] <= highest and abs(left[p]) < 0.5 * spacing:
+            across[int(abs(left[p]) / BIN)] += 1
+    least = EDGE * across.max()
+    edge = int(np.argmax(across))
+    while edge + 2 < len(across) and across[edge] + across[edge + 1] >= 2 * least:
+        edge += 1
+    return top, min(WIDER * edge * BIN + BESIDE, 0.5 * spacing)

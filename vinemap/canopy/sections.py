@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.canopy.points import Sections
+from vinemap.canopy.points import Sections, canopy_size
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
@@ -32,8 +32,8 @@ T = TypeVar("T")
 SOIL, SOIL_POINTS = 0.3, 200
 """Metres from the terrain within which points are the soil's, and how many of them, about, a section needs: dense
 clouds have many more, which would tell no more of the inter-row's elevation."""
-HALF = 0.9
-"""Metres to both sides of a row within which points are taken for canopy."""
+FOOT = 0.4
+"""Share of a row's height from which points are taken for canopy, where that is less than is asked for."""
 
 
 def cut_sections(
@@ -72,7 +72,7 @@ def cut_sections(
     min_points, max_width : int, float
         Points of canopy that sections of a row are widened for, and metres to which they may be.
     low, high : float
-        Heights in metres between which points count as canopy.
+        Heights in metres between which points count as canopy; the lower is less in rows that are low.
     """
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]
@@ -81,7 +81,8 @@ def cut_sections(
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
-        canopy, soil = _count(left, height, low, high)
+        top, half = canopy_size(left, height, float(spacing[row]), high)
+        canopy, soil = _count(left, height, half, min(low, FOOT * top), high)
         length = max(len(position) * step, step)
         a = max(width, min(max_width, min_points * length / max(canopy, 1)))
         every = max(1, int(soil * a / length / SOIL_POINTS))
@@ -136,11 +137,11 @@ def _take(
 
 
 @compiled
-def _count(left: Values, height: Values, low: float, high: float) -> tuple[int, int]:
-    """Points (n,) of the canopy, and of the soil."""
+def _count(left: Values, height: Values, half: float, low: float, high: float) -> tuple[int, int]:
+    """Points (n,) of the canopy, so many metres to both sides, and of the soil."""
     canopy, soil = 0, 0
     for p in range(len(left)):
-        canopy += low <= height[p] <= high and abs(left[p]) < HALF
+        canopy += low <= height[p] <= high and abs(left[p]) < half
         soil += abs(height[p]) < SOIL
     return canopy, soil
 

@@ -129,13 +129,17 @@ class SectionOptions(Options):
 class CanopyOptions(Options):
     """Canopy told from terrain."""
 
-    margin: float = Field(0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins (m)")
-    half_width: Metres = Field(0.9, description="distance from γ at which canopy ends (m)")
+    margin: float = Field(
+        0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins, less in low rows (m)"
+    )
+    half_width: float | None = Field(
+        None, gt=0, le=100, description="distance from γ at which canopy ends (m); none: what holds the row's"
+    )
     max_height: Metres = Field(3.6, description="height above terrain at which canopy ends (m)")
     min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
     min_points: int = Field(8, ge=3, description="canopy points of a section")
     min_share: Share = Field(0.15, description="share of the median section's points that a section has")
-    min_height: float = Field(0.8, ge=0, le=5, description="height of a section's highest tenth (m)")
+    min_height: float = Field(0.8, ge=0, le=5, description="height of a section's highest tenth, less in low rows (m)")
 
     @model_validator(mode="after")
     def _ordered(self) -> CanopyOptions:
