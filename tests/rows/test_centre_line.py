@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vinemap.rows.centre_line import runs_above, whittaker
+from vinemap.rows.centre_line import centre_line, runs_above, whittaker
 
 
 def test_runs_above_a_level():
@@ -34,3 +34,10 @@ def test_whittaker_fades_across_gaps_with_a_ridge():
     smooth = whittaker(values, weights, cutoff=20, ridge=0.02)
     assert abs(smooth[200]) < 0.2
     assert smooth[50] == pytest.approx(1, abs=0.03)
+
+
+def test_cover_within_the_flanks_moves_no_centre():
+    offsets = np.arange(-20, 21) * 0.05
+    one_sided = np.where(np.abs(offsets) < 0.62, 0.85 - 0.25 * offsets, 0.0)
+    centre = centre_line(np.tile(one_sided, (200, 1)), offsets, reach=0.9, cutoff=50)
+    assert np.abs(centre).max() < 0.01

@@ -16,6 +16,10 @@ TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""
 SLOPE = 1.0
 """Cutoff of a detail's slopes, in cutoffs of its bends."""
+BACKGROUND, FULL = 0.25, 0.65
+"""Shares of a row's cover: what is less isn't its canopy, and what is more counts no more than that."""
+USUAL = 0.8
+"""Metres to both sides of a row in which its canopy is looked for, if its spacing leaves as much."""
 CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 
@@ -38,7 +42,8 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
     """
     smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
     strength = np.quantile(smooth.max(axis=1), 0.7)
-    excess = np.maximum(smooth - 0.25 * strength, 0)
+    # Within the canopy cover tells how well it was seen; its middle is that of its flanks.
+    excess = np.clip(smooth - BACKGROUND * strength, 0, (FULL - BACKGROUND) * strength)
     centre: Values = np.zeros(len(image))
     for _ in range(4):
         amount, moment = _centroids(excess, offsets, centre, reach)
@@ -140,4 +145,4 @@ def runs_above(profile: Values, level: float) -> Values:
 
 def half_width(spacing: Values | float) -> Values:
     """Metres to both sides of a row, of a spacing in metres, in which its canopy is looked for."""
-    return np.minimum(0.8, 0.42 * np.asarray(spacing))
+    return np.minimum(USUAL, 0.42 * np.asarray(spacing))

@@ -14,15 +14,15 @@ import geopandas as gpd
 import numpy as np
 import shapely
 from scipy import sparse
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.sparse.linalg import spsolve
 
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, normals, resample, way_along
-from vinemap.geo.raster import Raster, nearest_cell, sample
-from vinemap.rows.centre_line import CELL, centre_line, half_width
+from vinemap.geo.raster import Raster, nearest_cell, sample, sample_across
+from vinemap.rows.centre_line import CELL, USUAL, centre_line, half_width
 from vinemap.rows.ends import Standing, cut_to_canopy
 
 if TYPE_CHECKING:
@@ -47,6 +47,12 @@ RAMP = 0.1
 """Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
 REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
+ABREAST = 0.48
+"""Share of the spacing, at the most, that lies to both sides of a row and is its own."""
+EDGE, ROOM = 0.2, 1.75
+"""Share of a row's cover at which its canopy ends across it, and how many times that far its points are taken."""
+APART = 0.3
+"""Share of a row's cover beside it up to which it stands apart from its neighbours."""
 LEAST_CONTRAST = 0.6
 """Contrast of a lone row's canopy to what lies beside it, below which it is a bush or a hedge."""
 VERTEX = 0.5
@@ -111,7 +117,7 @@ def fit_rows(
         ``end_m``, ``length_m`` along γ.
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
-    half = half_width(courses["spacing_m"].to_numpy())
+    half = _half_widths(courses, curves, cover, levels)
     fits: dict[int, Standing | None] = {}
     for group, shares in _deal(cloud, cover, levels, curves, half, high):
         found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
@@ -137,14 +143,61 @@ def fit_rows(
 def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
     """Centre line of a row about its course, between the ends of its canopy."""
     still = np.zeros(len(share.curve))
-    image, offsets = _straighten(share, share.ridge, still)
+    image, offsets = _straighten(share, share.body, still)
+    # Crowns lean to the side from which they were seen: where canopies stand apart whole, their flanks tell more.
+    if share.ridge is not share.body and not _stands_apart(image):
+        image, offsets = _straighten(share, share.ridge, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
-    shift = centre_line(image, offsets, reach=0.75 * share.half, cutoff=cutoff)
+    shift = centre_line(image, offsets, reach=_reach(image, offsets, share.half), cutoff=cutoff)
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
     body = ridge = _straighten(share, share.body, shift)[0]
     if share.ridge is not share.body:
         ridge = _straighten(share, share.ridge, shift)[0]
     return cut_to_canopy(centred, body, ridge, end_share)
+
+
+def _stands_apart(image: Values) -> bool:
+    """Whether a straightened row (stations, cells across) has little cover at both its sides."""
+    profile = image.mean(axis=0)
+    return bool(0.5 * (profile[0] + profile[-1]) <= APART * profile.max())
+
+
+def _reach(image: Values, offsets: Values, half: float) -> float:
+    """Metres to both sides of a row in which its middle is sought: all its canopy, and as much as rows usually have."""
+    profile = image.mean(axis=0)
+    least = 0.75 * min(half, USUAL)
+    inside = np.abs(offsets[profile > 0.5 * EDGE * profile.max()]).max(initial=0.0) + 2 * CELL
+    return float(np.clip(inside, least, max(half - CELL, least)))
+
+
+def _half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Raster, levels: Levels) -> Values:
+    """Metres to both sides of courses in which their canopy is looked for: more where it is wide among others."""
+    spacing, alone = (courses[name].to_numpy() for name in ("spacing_m", "alone"))
+    half: Values = half_width(spacing)
+    for k in np.flatnonzero(~alone).tolist():
+        stations, most = curves[k][:: round(1 / CELL)], max(half[k], ABREAST * spacing[k])
+        if (sample(levels.ridge, stations) > sample(levels.body, stations)).any():
+            half[k] = most
+            continue
+        aside = np.arange(0.0, spacing[k] / 2, cover.grid.resolution)
+        offsets = np.concatenate([-aside[:0:-1], aside])
+        profile: Values = sample_across(cover, stations, normals(stations, smoothing=1.0), offsets).mean(axis=0)
+        both = profile[len(aside) - 1 :] + profile[len(aside) - 1 :: -1]
+        half[k] = np.clip(ROOM * aside[both >= EDGE * both.max()][-1], half[k], most)
+    return half
+
+
+def _beside_ridges(cover: Raster, levels: Levels, half: Values) -> Flags:
+    """Cells with cover and, where that is of ridges alone, those beside, as canopies are wider below."""
+    vines: Flags = cover.values > 0
+    touching = levels.ridge.values > levels.body.values
+    x, y = cover.grid.centres()
+    metres = levels.body.grid
+    i = np.clip((metres.north - y) / metres.resolution, 0, metres.ny - 1).astype(int)
+    j = np.clip((x - metres.west) / metres.resolution, 0, metres.nx - 1).astype(int)
+    wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
+    vines |= wider & touching[np.ix_(i, j)]
+    return vines
 
 
 def _smooth_course(course: Values) -> Values:
@@ -165,7 +218,8 @@ def _deal(
     cloud: Cloud, cover: Raster, levels: Levels, curves: Sequence[Values], half: Values, high: float
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
-    vines = cover.values > 0
+    touching = bool((levels.ridge.values > levels.body.values).any())
+    vines = _beside_ridges(cover, levels, half) if touching else cover.values > 0
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
         def above(level: Raster) -> Values:
@@ -178,7 +232,7 @@ def _deal(
             return canopy
 
         body = above(levels.body)
-        return body, body if levels.ridge is levels.body else above(levels.ridge)
+        return body, above(levels.ridge) if touching else body
 
     for rows, near, (body, ridge) in points_of_rows(cloud, curves, half + REACH, canopy_of):
         shares = []
