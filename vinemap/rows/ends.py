@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 AROUND = 0.3
 """Metres, a standard deviation, of the surroundings with which the canopy of an end is compared."""
+CORE, NARROW = 0.5, 0.5
+"""Share of a canopy's half width, and metres to both sides at the least, within which it tells where it ends."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
 NARROWEST, WIDEST = 0.7, 1.6
@@ -38,7 +40,7 @@ def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float)
 
     Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out.
     """
-    profile = image.sum(axis=1) * CELL
+    profile = _core(image).sum(axis=1) * CELL
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     if len(present) == 0:
         return None
@@ -61,6 +63,19 @@ def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
     return Standing(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
+
+
+def _core(image: Values) -> Values:
+    """Middle of a straightened row (stations, cells across): wide canopies end round, there last.
+
+    All of it, where the row is narrow or its middle hollow.
+    """
+    across, middle = image.mean(axis=0), image.shape[1] // 2
+    if across[middle] < 0.5 * across.max():
+        return image
+    half = 0.5 * CELL * np.count_nonzero(across >= 0.5 * across.max())
+    reach = round(max(CORE * half, NARROW) / CELL)
+    return image[:, max(middle - reach, 0) : middle + reach + 1]
 
 
 def count_missing(

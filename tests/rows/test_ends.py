@@ -1,0 +1,14 @@
+import numpy as np
+
+from vinemap.rows.centre_line import CELL
+from vinemap.rows.ends import cut_to_canopy
+
+
+def test_a_wide_canopy_ends_where_its_middle_does():
+    x, offsets = np.arange(400) * CELL, np.arange(-24, 25) * CELL
+    inside = np.minimum(x - 3, 17 - x)
+    half = np.where(inside > 0, 1.1 * np.sqrt(np.clip(inside / 0.5, 0, 1)), -1)
+    image = (np.abs(offsets) < half[:, None]).astype(float)
+    standing = cut_to_canopy(np.column_stack([x, 0 * x]), image, image, 0.6)
+    assert standing is not None
+    assert np.allclose(standing.curve[[0, -1], 0], [3, 17], atol=0.07)
