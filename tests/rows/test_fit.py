@@ -1,5 +1,6 @@
 import geopandas as gpd
 import numpy as np
+import pytest
 import shapely
 
 from vinemap.cloud.points import PointCloud
@@ -8,7 +9,8 @@ from vinemap.rows.fit import fit_rows
 from vinemap.surfaces.cover import Levels
 
 
-def test_wide_canopies_have_their_middle_between_their_flanks():
+@pytest.mark.parametrize(("start", "end"), [(2.5, 13.5), (6, 11)])
+def test_wide_canopies_have_their_middle_between_their_flanks_and_are_followed_to_their_ends(start, end):
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(0, 16, 20_000), rng.uniform(-1.5, 1.5, 20_000), np.zeros(20_000)])
     body = np.column_stack([rng.uniform(2, 14, 10_000), rng.uniform(-0.9, 0.9, 10_000), rng.uniform(0.7, 1.2, 10_000)])
@@ -20,7 +22,7 @@ def test_wide_canopies_have_their_middle_between_their_flanks():
     of_ridges = ((x > 2) & (x < 14) & (y > -0.1) & (y < 0.7)).astype(np.float32)
     levels = Levels(*(Raster(np.full(metres.shape, level, np.float32), metres, None) for level in (0.5, 1.3)))
     course = gpd.GeoDataFrame(
-        {"spacing_m": [2.4], "alone": [False]}, geometry=[shapely.LineString([(2.5, 0.3), (13.5, 0.3)])]
+        {"spacing_m": [2.4], "alone": [False]}, geometry=[shapely.LineString([(start, 0.3), (end, 0.3)])]
     )
     dtm = Raster(np.zeros(metres.shape, np.float32), metres, None)
     rows, _ = fit_rows(course, cloud, Raster(of_ridges, fine, None), levels, dtm)

@@ -28,11 +28,15 @@ USUAL = 1.0
 
 
 class Standing(NamedTuple):
-    """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast."""
+    """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
+
+    ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it.
+    """
 
     curve: Values
     runs: Values
     contrast: float
+    goes_on: tuple[bool, bool]
 
 
 def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float) -> Standing | None:
@@ -62,7 +66,9 @@ def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float)
     aside = max(1, canopy.shape[1] // 8)
     beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
     contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
-    return Standing(between(curve, metres[0, 0], metres[-1, 1]), metres - metres[0, 0], contrast)
+    first, last = metres[0, 0], metres[-1, 1]
+    goes_on = bool(first < USUAL), bool(last > way_along(curve)[-1] - USUAL)
+    return Standing(between(curve, first, last), metres - first, contrast, goes_on)
 
 
 def _core(image: Values) -> Values:

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import spsolve
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import between, normals, resample, way_along
+from vinemap.geo.curve import between, extend, normals, resample, way_along
 from vinemap.geo.raster import Raster, nearest_cell, sample, sample_across
 from vinemap.rows.centre_line import CELL, USUAL, centre_line, half_width
 from vinemap.rows.ends import Standing, cut_to_canopy
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
+FARTHER = 4
+"""Times that it is looked for as far again, where it hasn't ended."""
 COURSE = 20.0
 """Wavelength in metres below which a course's bends are not trusted."""
 POINTS_A_METRE = 200.0
@@ -119,9 +121,16 @@ def fit_rows(
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     half = _half_widths(courses, curves, cover, levels)
     fits: dict[int, Standing | None] = {}
-    for group, shares in _deal(cloud, cover, levels, curves, half, high):
-        found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
-        fits |= dict(zip(group.tolist(), found, strict=True))
+    members, vines = np.arange(len(curves)), _where_vines_are(cover, levels, half)
+    for _ in range(1 + FARTHER):
+        for group, shares in _deal(cloud, vines, levels, curves, half[members], high):
+            found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
+            fits |= dict(zip(members[group].tolist(), found, strict=True))
+        unended = _unended(fits, half)
+        if not unended:
+            break
+        members = np.array(list(unended))
+        curves = [_smooth_course(curve) for curve in unended.values()]
     rows: list[tuple[object, ...]] = []
     gaps: list[tuple[object, ...]] = []
     for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True)):
@@ -156,6 +165,21 @@ def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | Non
     return cut_to_canopy(centred, body, ridge, end_share)
 
 
+def _unended(fits: dict[int, Standing | None], half: Values) -> dict[int, Values]:
+    """Curves of the rows whose canopy may go on where it wasn't looked for, and not into another row."""
+    standing = {k: fit for k, fit in fits.items() if fit}
+    out = {}
+    for k, fit in standing.items():
+        if not any(fit.goes_on):
+            continue
+        longer = extend(fit.curve, MARGIN)
+        ways = [w for w, on in zip((longer[:2], longer[-2:]), fit.goes_on, strict=True) if on]
+        others = [shapely.LineString(other.curve) for j, other in standing.items() if j != k]
+        if not any(shapely.dwithin(shapely.LineString(way), others, half[k]).any() for way in ways):
+            out[k] = fit.curve
+    return out
+
+
 def _stands_apart(image: Values) -> bool:
     """Whether a straightened row (stations, cells across) has little cover at both its sides."""
     profile = image.mean(axis=0)
@@ -187,17 +211,18 @@ def _half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Ras
     return half
 
 
-def _beside_ridges(cover: Raster, levels: Levels, half: Values) -> Flags:
+def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags, Grid]:
     """Cells with cover and, where that is of ridges alone, those beside, as canopies are wider below."""
     vines: Flags = cover.values > 0
     touching = levels.ridge.values > levels.body.values
-    x, y = cover.grid.centres()
-    metres = levels.body.grid
-    i = np.clip((metres.north - y) / metres.resolution, 0, metres.ny - 1).astype(int)
-    j = np.clip((x - metres.west) / metres.resolution, 0, metres.nx - 1).astype(int)
-    wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
-    vines |= wider & touching[np.ix_(i, j)]
-    return vines
+    if touching.any() and len(half):
+        x, y = cover.grid.centres()
+        metres = levels.body.grid
+        i = np.clip((metres.north - y) / metres.resolution, 0, metres.ny - 1).astype(int)
+        j = np.clip((x - metres.west) / metres.resolution, 0, metres.nx - 1).astype(int)
+        wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
+        vines |= wider & touching[np.ix_(i, j)]
+    return vines, cover.grid
 
 
 def _smooth_course(course: Values) -> Values:
@@ -215,16 +240,15 @@ def _smooth_course(course: Values) -> Values:
 
 
 def _deal(
-    cloud: Cloud, cover: Raster, levels: Levels, curves: Sequence[Values], half: Values, high: float
+    cloud: Cloud, vines: tuple[Flags, Grid], levels: Levels, curves: Sequence[Values], half: Values, high: float
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
     touching = bool((levels.ridge.values > levels.body.values).any())
-    vines = _beside_ridges(cover, levels, half) if touching else cover.values > 0
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
         def above(level: Raster) -> Values:
             canopy = np.zeros(len(member), dtype=np.float32)
-            at = (vines, cover.grid), (level.values, level.grid)
+            at = vines, (level.values, level.grid)
             in_threads(
                 lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, at, high, canopy),
                 stretches(len(canopy)),
