@@ -172,7 +172,7 @@ def _unended(fits: dict[int, Standing | None], half: Values) -> dict[int, Values
     for k, fit in standing.items():
         if not any(fit.goes_on):
             continue
-        longer = extend(fit.curve, MARGIN)
+        longer = extend(fit.curve, 2 * MARGIN)
         ways = [w for w, on in zip((longer[:2], longer[-2:]), fit.goes_on, strict=True) if on]
         others = [shapely.LineString(other.curve) for j, other in standing.items() if j != k]
         if not any(shapely.dwithin(shapely.LineString(way), others, half[k]).any() for way in ways):
