@@ -136,8 +136,10 @@ def _canopy_height(chm: Raster, high: float) -> Values:
 
 
 def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Grid, resolution: float) -> Flags:
-    """Cells of 1 m in which rows are told by where they stand apart: where they touch, and about it, so that a row is
-    cut at one level all along; but rows that are lower than those that touch keep theirs."""
+    """Cells of 1 m in which rows are told by where they stand apart: those where they touch, and those about them.
+
+    So a row is cut at one level all along. Rows that are lower than those that touch keep theirs.
+    """
     out = np.zeros(metres.ny * metres.nx, dtype=bool)
     if not touching.any():
         return out.reshape(metres.shape)
