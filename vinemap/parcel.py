@@ -35,7 +35,7 @@ from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
 from vinemap.rows.blocks import group_blocks
 from vinemap.rows.clusters import cluster_rows
-from vinemap.rows.confidence import judge_rows
+from vinemap.rows.confidence import believed, judge_rows
 from vinemap.rows.curves import trace_rows
 from vinemap.rows.ends import count_missing
 from vinemap.rows.field import estimate_row_field, refine_row_field
@@ -160,9 +160,9 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
     courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     options["fit"]["high"] = settings.cover.high
-    fitted = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
-    rows, gaps = number_rows(group_blocks(fitted[0]), fitted[1])
-    rows, gaps = count_missing(judge_rows(rows, cover, chm), gaps, **options["missing"])
+    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
+    rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm), gaps, **options["judging"])
+    rows, gaps = count_missing(*number_rows(rows, gaps), **options["missing"])
     return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 

@@ -7,7 +7,7 @@ import shapely
 
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.blocks import group_blocks
-from vinemap.rows.confidence import judge_rows
+from vinemap.rows.confidence import believed, judge_rows
 
 SPACING = 2.5
 
@@ -100,3 +100,16 @@ def test_it_does_not_matter_which_end_a_row_starts_at():
     lines = block(4)
     turned = judged([line[::-1] if k % 2 else line for k, line in enumerate(lines)])
     assert turned["confidence"].to_numpy() == pytest.approx(judged(lines)["confidence"].to_numpy())
+
+
+def test_rows_that_are_hardly_sure_are_none():
+    rows = gpd.GeoDataFrame(
+        {"confidence": [0.9, 0.1, 0.8]}, geometry=[shapely.LineString([(0, k), (9, k)]) for k in range(3)]
+    )
+    gaps = gpd.GeoDataFrame({"row": [0, 1, 2, 2]}, geometry=list(rows.geometry.iloc[[0, 1, 2, 2]]))
+    kept, theirs = believed(rows, gaps)
+    assert list(kept["confidence"]) == [0.9, 0.8]
+    assert list(theirs["row"]) == [0, 1, 1]
+    assert all(line.equals(kept.geometry[row]) for row, line in zip(theirs["row"], theirs.geometry, strict=True))
+    none, nothing = believed(rows, gaps, min_confidence=1.0)
+    assert len(none) == len(nothing) == 0

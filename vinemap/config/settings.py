@@ -111,6 +111,12 @@ class FitOptions(Options):
     min_gap: Metres = Field(0.8, description="length without canopy that is a gap (m)")
 
 
+class JudgingOptions(Options):
+    """What is a row, and what isn't."""
+
+    min_confidence: Share = Field(0.3, description="confidence below which it is none, but stands in unmapped")
+
+
 class MissingOptions(Options):
     """Missing vines."""
 
@@ -190,6 +196,7 @@ class Settings(Options):
     clustering: ClusteringOptions = ClusteringOptions()
     curves: CurveOptions = CurveOptions()
     fit: FitOptions = FitOptions()
+    judging: JudgingOptions = JudgingOptions()
     missing: MissingOptions = MissingOptions()
     sections: SectionOptions = SectionOptions()
     canopy: CanopyOptions = CanopyOptions()

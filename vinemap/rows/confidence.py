@@ -106,6 +106,27 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDat
     return rows.assign(confidence=1 / (1 + np.exp(-odds)), flags=_flags(rows))
 
 
+def believed(
+    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, min_confidence: float = 0.3
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Rows that are at least so sure, and their gaps: less sure ones are more often none than not.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        With ``confidence``.
+    gaps : GeoDataFrame
+        With ``row`` (position in rows).
+    min_confidence : float
+        Confidence of a row.
+    """
+    held = (rows["confidence"] >= min_confidence).to_numpy(dtype=bool)
+    row = gaps["row"].to_numpy(dtype=np.int64)
+    position = np.cumsum(held) - 1
+    left = gaps[held[row]] if len(gaps) else gaps
+    return rows[held].reset_index(drop=True), left.assign(row=position[row[held[row]]]).reset_index(drop=True)
+
+
 def _flags(rows: gpd.GeoDataFrame) -> list[str]:
     """What is odd about each row, in words separated by commas."""
     lines = shapely.force_2d(rows.geometry.to_numpy())
