@@ -98,3 +98,8 @@ def test_vines_in_a_square_have_rows_in_one_direction(along, length):
     rows = 0.0 if along < 2 or wide > high else 90.0
     assert np.quantile(axial(field.direction.values[held], rows), 0.95) < 3
     assert np.median(field.spacing.values[held]) == pytest.approx(2.0, rel=0.03)
+    other = estimate_row_field(cover, row_direction=rows + 92)
+    held = other.likelihood.values > 0.1
+    assert held.any()
+    assert not other.square
+    assert np.quantile(axial(other.direction.values[held], rows + 90), 0.95) < 3

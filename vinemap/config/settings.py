@@ -58,6 +58,9 @@ class RowFieldOptions(Options):
     step: float = Field(2.0, ge=0.5, le=20, description="distance of the windows (m)")
     min_spacing: float = Field(0.8, ge=0.5, le=10, description="smallest inter-row spacing (m)")
     max_spacing: float = Field(6.0, ge=0.8, le=10, description="largest inter-row spacing (m)")
+    row_direction: float | None = Field(
+        None, ge=-180, le=180, description="direction of all rows (degrees anticlockwise from east); none: found"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> RowFieldOptions:

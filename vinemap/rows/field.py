@@ -30,7 +30,7 @@ from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowFi
 if TYPE_CHECKING:
     import geopandas as gpd
 
-    from vinemap.compute.arrays import Ints, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
@@ -55,6 +55,7 @@ def estimate_row_field(
     step: float = 2.0,
     min_spacing: float = 0.8,
     max_spacing: float = 6.0,
+    row_direction: float | None = None,
 ) -> RowField:
     """Estimate the row field from canopy cover.
 
@@ -68,6 +69,8 @@ def estimate_row_field(
         Width of the square windows of the spectrum, radius of the cylinders, and the distance of both, in metres.
     min_spacing, max_spacing : float
         Band of inter-row spacings in metres in which the peak is sought.
+    row_direction : float, optional
+        Direction of all rows, in degrees anticlockwise from the grid's east, within 12°; by default it is found.
 
     Returns
     -------
@@ -81,8 +84,11 @@ def estimate_row_field(
     peaks, *others = scan(base.values, size, step, band)
     least = (window / 2 / step) ** 2
     square = False
-    for second in others:
-        peaks, square = _one_way(peaks, second, least=least)
+    if row_direction is not None:
+        peaks = _prescribed([peaks, *others], np.radians(row_direction))
+    else:
+        for second in others:
+            peaks, square = _one_way(peaks, second, least=least)
     peaks = _settled(_axial_median(peaks), least=least)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
@@ -155,14 +161,33 @@ def _one_way(peaks: Peaks, second: Peaks, *, least: float) -> tuple[Peaks, bool]
         around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
         mine = around & (_axial(peaks.direction, chosen) < NEAR_WAY)
         other = around & ~mine & (second.strength > 0) & (_axial(second.direction, chosen) < NEAR_WAY)
-        known, wrong = mine | other, around & ~mine & ~other
         for values, second_values in zip(out, second, strict=True):
             values[other] = second_values[other]
-        if known.any():
-            a, b = distance_transform_edt(~known, return_distances=False, return_indices=True)
-            for values in out[:2]:
-                values[wrong] = values[a, b][wrong]
+        _spread(out, mine | other, around & ~mine & ~other)
     return Peaks(*out), square
+
+
+def _prescribed(waves: list[Peaks], way: float) -> Peaks:
+    """The stronger wave of each window within ``NEAR_WAY`` of a direction; where there is none, that of the nearest."""
+    out = [values.copy() for values in waves[0]]
+    known = np.zeros(out[0].shape, dtype=bool)
+    for wave in waves:
+        near = ~known & (wave.strength > 0) & (_axial(wave.direction, way) < NEAR_WAY)
+        for values, mine in zip(out, wave, strict=True):
+            values[near] = mine[near]
+        known |= near
+    if not known.any():
+        return Peaks(out[0], out[1], np.zeros_like(out[2]))
+    _spread(out, known, ~known & (waves[0].strength > 0))
+    return Peaks(*out)
+
+
+def _spread(waves: list[Values], known: Flags, wrong: Flags) -> None:
+    """Give windows that are wrong the direction and spacing of the nearest that are known."""
+    if known.any():
+        a, b = distance_transform_edt(~known, return_distances=False, return_indices=True)
+        for values in waves[:2]:
+            values[wrong] = values[a, b][wrong]
 
 
 def _axial(direction: Values, way: float | Values) -> Values:
