@@ -47,7 +47,7 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
     data = np.concatenate(frames)
     data = data[np.random.default_rng(0).permutation(len(data))]
     points = gpd.GeoDataFrame(
-        {"direction_deg": data[:, 2], "cluster": data[:, 3].astype(int), "spacing_m": 2.5},
+        {"direction_deg": data[:, 2], "cluster": data[:, 3].astype(int), "spacing_m": 2.5, "curtains_m": 0.0},
         geometry=gpd.points_from_xy(data[:, 0], data[:, 1]),
         crs=UTM,
     )
@@ -151,7 +151,9 @@ def test_a_bush_as_long_as_a_row_is_none():
     """A row has free ground beside it."""
     bush = scene([np.array([[0, 0], [12.0, 0]])], width=1.5)
     courses = gpd.GeoDataFrame(
-        {"spacing_m": [4.5], "alone": [True]}, geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])], crs=UTM
+        {"spacing_m": [4.5], "curtains_m": [0.0], "alone": [True]},
+        geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])],
+        crs=UTM,
     )
     assert len(fit_rows(courses, bush.cloud, bush.cover, level_of(bush), bush.dtm)[0]) == 0
     row = scene([np.array([[0, 0], [12.0, 0]])], width=0.7)

@@ -39,7 +39,34 @@ def test_centres_of_straight_rows(direction):
     assert np.abs((off / spacing + 0.5) % 1 - 0.5)[inside].max() * spacing < 0.02
     assert inside.sum() > 34 * 34 / spacing * 2
     assert np.allclose(points.get_coordinates(include_z=True)["z"], 7.0)
-    assert set(points.columns) == {"cover", "direction_deg", "spacing_m", "geometry"}
+    assert set(points.columns) == {"cover", "direction_deg", "spacing_m", "curtains_m", "geometry"}
+    assert (points["curtains_m"] == 0).all()
+
+
+@pytest.mark.parametrize(("spacing", "curtains", "told"), [(3.8, 1.1, 3.8), (3.2, 1.2, 1.6), (3.2, 1.6, 1.6)])
+def test_two_curtains_are_one_row(spacing, curtains, told):
+    """Also where the field takes a curtain's distance for the rows'; but equal distances are those of rows."""
+    grid, direction = Grid(0.0, 30.0, 0.1, 300, 300), 30.0
+    x, y = np.meshgrid(*grid.centres())
+    across = -x * np.sin(np.radians(direction)) + y * np.cos(np.radians(direction))
+    off = np.abs((across / spacing + 0.5) % 1 - 0.5) * spacing
+    cover = np.clip(1.5 - np.abs(off - curtains / 2) / 0.2, 0, 0.8)
+    coarse = Grid(0.0, 30.0, 1.0, 30, 30)
+
+    def constant(value):
+        return Raster(np.full((30, 30), value), coarse, UTM)
+
+    field = RowField(constant(direction), constant(told), constant(1.0))
+    points = detect_key_points(Raster(cover, grid, UTM), constant(0.0), field)
+    xy = points.get_coordinates().to_numpy()
+    inside = ((xy > 4) & (xy < 26)).all(axis=1)
+    off = (xy[:, 1] * np.cos(np.radians(direction)) - xy[:, 0] * np.sin(np.radians(direction)))[inside]
+    double = curtains < spacing / 2
+    off = off if double else off - curtains / 2
+    row = spacing if double else spacing / 2
+    assert np.abs((off / row + 0.5) % 1 - 0.5).max() * row < 0.03
+    assert points["spacing_m"][inside].to_numpy() == pytest.approx(row, rel=0.03)
+    assert points["curtains_m"][inside].to_numpy() == pytest.approx(curtains if double else 0, abs=0.05)
 
 
 def test_no_likelihood_no_key_points():

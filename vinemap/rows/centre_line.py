@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, shift
 
 from vinemap.compute.compiled import compiled
 
@@ -24,7 +24,7 @@ CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 
 
-def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) -> Values:
+def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float, curtains: float = 0.0) -> Values:
     """Offset in metres (n,) of the canopy's centre from a curve at each station of a straightened row.
 
     Centroids above a background, within ``reach`` metres of the smoothed centre so far, smoothed robustly.
@@ -39,7 +39,11 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
         Metres to both sides.
     cutoff : float
         Wavelength in stations below which bends are noise.
+    curtains : float
+        Metres between the two curtains of a double canopy, whose centre lies between them; 0 where there is one.
     """
+    if curtains:
+        image, reach = _laid_together(image, offsets, curtains), curtains / 2
     smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
     strength = np.quantile(smooth.max(axis=1), 0.7)
     # Within the canopy cover tells how well it was seen; its middle is that of its flanks.
@@ -61,6 +65,14 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float) 
             scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
             robust = 1 / (1 + (residual / (2 * scale)) ** 2)
     return centre
+
+
+def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
+    """Image (n, m) with both curtains on the middle between them, each in half, however uneven they are."""
+    cells = curtains / 2 / (offsets[1] - offsets[0])
+    left, right = (shift(image, (0, way * cells), order=1, mode="nearest") for way in (-1, 1))
+    out: Values = (left + right) / 2
+    return out
 
 
 @compiled

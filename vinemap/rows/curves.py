@@ -67,7 +67,7 @@ def trace_rows(
     Parameters
     ----------
     key_points : GeoDataFrame
-        Points with ``cluster``, ``direction_deg`` and ``spacing_m``.
+        Points with ``cluster``, ``direction_deg``, ``spacing_m`` and ``curtains_m``.
     cover : Raster
         Canopy cover 0–1.
     threshold : float
@@ -84,28 +84,26 @@ def trace_rows(
     Returns
     -------
     GeoDataFrame
-        LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
+        LineString with ``spacing_m``, ``curtains_m`` (between two curtains of a row, 0 where it has one) and ``alone``
+        (whether no other row runs beside it).
     """
-    xy, direction, spacing = (
-        key_points.get_coordinates().to_numpy(),
-        np.radians(key_points["direction_deg"].to_numpy()),
-        key_points["spacing_m"].to_numpy(),
-    )
+    xy, direction = key_points.get_coordinates().to_numpy(), np.radians(key_points["direction_deg"].to_numpy())
+    spacing, curtains = key_points["spacing_m"].to_numpy(), key_points["curtains_m"].to_numpy()
 
-    def trace(members: Ints) -> tuple[float, float, float, shapely.LineString] | None:
+    def trace(members: Ints) -> tuple[float, float, float, float, shapely.LineString] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
-        between = float(np.median(spacing[members]))
-        course = _centred(ordered, cover, between) if len(ordered) > 1 else None
+        between, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
+        course = _centred(ordered, cover, between, double) if len(ordered) > 1 else None
         if course is None or course.width > max(max_width, CLOSED * between) or course.support < min_support:
             return None
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
         fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
-        return (between, course.width, course.amount, line) if fits else None
+        return (between, double, course.width, course.amount, line) if fits else None
 
     clusters = key_points.groupby("cluster").indices
     records = [record for record in in_threads(trace, clusters.values()) if record]
-    columns = ("spacing_m", "width", "amount")
+    columns = ("spacing_m", "curtains_m", "width", "amount")
     rows = gpd.GeoDataFrame(
         {name: [r[k] for r in records] for k, name in enumerate(columns)},
         geometry=[r[-1] for r in records],
@@ -117,7 +115,7 @@ def trace_rows(
     least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
     alone = ~_accompanied(rows)
     odd = alone & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
-    return rows.assign(alone=alone).loc[~odd, ["spacing_m", "alone", "geometry"]].reset_index(drop=True)
+    return rows.assign(alone=alone).loc[~odd, ["spacing_m", "curtains_m", "alone", "geometry"]].reset_index(drop=True)
 
 
 def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -> Values:
@@ -174,15 +172,15 @@ def _scan(xy: Values, direction: Values, start: int, heading: Values, threshold:
     return found
 
 
-def _centred(ordered: Values, cover: Raster, spacing: float) -> _Course | None:
+def _centred(ordered: Values, cover: Raster, spacing: float, curtains: float) -> _Course | None:
     """Course along the middle of the canopy, from where it begins to where it ends."""
-    half = float(half_width(spacing))
+    half = float(half_width(spacing)) + curtains / 2
     curve = resample(extend(ordered, min(2.0, 0.8 * spacing)), STATION)
     # Key points zigzag; what is added to their course is smooth and would leave the zigzag in.
     even = np.ones(len(curve))
     curve = np.column_stack([whittaker(curve[:, k], even, cutoff=ZIGZAG / STATION) for k in (0, 1)])
     image, offsets = _straighten(cover, curve, half)
-    shift = centre_line(image, offsets, reach=half, cutoff=SMOOTHING / STATION)
+    shift = centre_line(image, offsets, reach=half, cutoff=SMOOTHING / STATION, curtains=curtains)
     curve = resample(curve + shift[:, None] * normals(curve, smoothing=1 / STATION), STATION)
     image, offsets = _straighten(cover, curve, half)
     profile = image.sum(axis=1) * BIN

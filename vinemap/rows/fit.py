@@ -62,13 +62,14 @@ VERTEX = 0.5
 
 
 class _Share(NamedTuple):
-    """A row's course (n, 2), the canopy's half width in metres, and points: station, metres to its left, canopy 0–1.
+    """A row's course (n, 2), half width and distance of two curtains in metres, and points: station, left, canopy 0–1.
 
     Canopy is what stands above the level of its body, and that of its ridge.
     """
 
     curve: Values
     half: float
+    curtains: float
     station: Values
     left: Values
     body: Values
@@ -92,7 +93,8 @@ def fit_rows(
     Parameters
     ----------
     courses : GeoDataFrame
-        LineString with ``spacing_m`` and ``alone`` (whether no other row runs beside it).
+        LineString with ``spacing_m``, ``curtains_m`` (between two curtains of a row, 0 where it has one) and ``alone``
+        (whether no other row runs beside it).
     cloud : PointCloud or TiledCloud
         The parcel's points with their heights above ground.
     cover : Raster
@@ -119,11 +121,12 @@ def fit_rows(
         ``end_m``, ``length_m`` along γ.
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
-    half = _half_widths(courses, curves, cover, levels)
+    curtains = courses["curtains_m"].to_numpy()
+    half = np.maximum(_half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
     fits: dict[int, Standing | None] = {}
     members, vines = np.arange(len(curves)), _where_vines_are(cover, levels, half)
     for _ in range(1 + FARTHER):
-        for group, shares in _deal(cloud, vines, levels, curves, half[members], high):
+        for group, shares in _deal(cloud, vines, levels, curves, half[members], curtains[members], high):
             found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
             fits |= dict(zip(members[group].tolist(), found, strict=True))
         unended = _unended(fits, half)
@@ -157,7 +160,8 @@ def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | Non
     if share.ridge is not share.body and not _stands_apart(image):
         image, offsets = _straighten(share, share.ridge, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
-    shift = centre_line(image, offsets, reach=_reach(image, offsets, share.half), cutoff=cutoff)
+    reach = _reach(image, offsets, share.half)
+    shift = centre_line(image, offsets, reach=reach, cutoff=cutoff, curtains=share.curtains)
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
     body = ridge = _straighten(share, share.body, shift)[0]
     if share.ridge is not share.body:
@@ -240,7 +244,13 @@ def _smooth_course(course: Values) -> Values:
 
 
 def _deal(
-    cloud: Cloud, vines: tuple[Flags, Grid], levels: Levels, curves: Sequence[Values], half: Values, high: float
+    cloud: Cloud,
+    vines: tuple[Flags, Grid],
+    levels: Levels,
+    curves: Sequence[Values],
+    half: Values,
+    curtains: Values,
+    high: float,
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
     touching = bool((levels.ridge.values > levels.body.values).any())
@@ -264,7 +274,8 @@ def _deal(
             mine = slice(near.start[k], near.start[k + 1])
             scale = np.float32((len(curves[row]) - 1) / way_along(curves[row])[-1])
             columns = (body[mine],) * 2 if ridge is body else (body[mine], ridge[mine])
-            shares.append(_Share(curves[row], float(half[row]), near.along[mine] * scale, near.left[mine], *columns))
+            about = float(half[row]), float(curtains[row])
+            shares.append(_Share(curves[row], *about, near.along[mine] * scale, near.left[mine], *columns))
         yield rows, shares
 
 
