@@ -42,7 +42,7 @@ from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
 from vinemap.rows.numbers import describe_rows, number_rows
-from vinemap.surfaces.canopy_height import canopy_height_model
+from vinemap.surfaces.ceiling import heights_of_vines
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
 from vinemap.surfaces.statistics import block_side
@@ -128,8 +128,8 @@ class RowMap(NamedTuple):
 def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster]:
     """Find the terrain of a cloud: the cloud with its heights above it, the terrain, and the canopies' height."""
     dtm = terrain_model(points, **settings.ground.model_dump())
-    cloud = points.above(dtm)
-    chm = canopy_height_model(cloud, resolution=settings.ground.resolution)
+    how = {"resolution": settings.ground.resolution, "high": settings.cover.high}
+    cloud, chm = heights_of_vines(points, dtm, **how)
     cloud.forget()
     return cloud, dtm, chm
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap.cloud.bins import bin_points
-from vinemap.geo.raster import above, extent
+from vinemap.geo.raster import above, cell_of, extent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from vinemap.cloud.bins import Bins
     from vinemap.compute.arrays import Floats, Values
     from vinemap.geo.raster import Grid, Raster
+
+HIDDEN = -1.0
+"""Height in metres of points that are out of sight: no soil, and no canopy."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,9 @@ class PointCloud:
         """Give back the memory of what is kept for speed."""
         self._kept.clear()
 
-    def above(self, dtm: Raster) -> PointCloud:
-        """The cloud with its heights above a terrain model."""
-        return replace(self, heights=above(dtm, self.xyz))
+    def above(self, dtm: Raster, ceiling: Raster | None = None) -> PointCloud:
+        """The cloud with its heights above a terrain model; what is higher than a ceiling is ``HIDDEN``."""
+        heights = above(dtm, self.xyz)
+        if ceiling:
+            heights[heights > ceiling.values.ravel()[cell_of(self.xyz, ceiling.grid)]] = HIDDEN
+        return replace(self, heights=heights)

@@ -50,6 +50,7 @@ class TiledCloud:
     crs: CRS
     vertical: str | None = None
     dtm: Raster | None = None
+    ceiling: Raster | None = None
 
     @property
     def size(self) -> int:
@@ -68,14 +69,14 @@ class TiledCloud:
             box = shapely.box(*tile.low[:2], *tile.high[:2])
             if near is None or shapely.dwithin(box, near, reach):
                 part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
-                yield part.above(self.dtm) if self.dtm else part
+                yield part.above(self.dtm, self.ceiling) if self.dtm else part
 
     def forget(self) -> None:
         """Nothing is kept for speed."""
 
-    def above(self, dtm: Raster) -> TiledCloud:
-        """The cloud with its heights above a terrain model."""
-        return replace(self, dtm=dtm)
+    def above(self, dtm: Raster, ceiling: Raster | None = None) -> TiledCloud:
+        """The cloud with its heights above a terrain model; what is higher than a ceiling is hidden."""
+        return replace(self, dtm=dtm, ceiling=ceiling)
 
 
 Cloud = PointCloud | TiledCloud

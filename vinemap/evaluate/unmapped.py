@@ -12,7 +12,8 @@ from scipy.ndimage import binary_dilation, binary_opening, distance_transform_ed
 from scipy.spatial import cKDTree
 
 from vinemap.geo.raster import Grid, Raster, block_sum, coarser
-from vinemap.surfaces.cover import LOWEST, WIDEST
+from vinemap.surfaces.cover import WIDEST
+from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Floats

@@ -130,6 +130,15 @@ def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int32]:
     return out
 
 
+def cells_in(coarse: Grid, fine: Grid) -> NDArray[np.int64]:
+    """Index (ny, nx) of the coarse cell in which each fine one lies."""
+    x, y = fine.centres()
+    i = np.clip(((coarse.north - y) / coarse.resolution).astype(int), 0, coarse.ny - 1)
+    j = np.clip(((x - coarse.west) / coarse.resolution).astype(int), 0, coarse.nx - 1)
+    out: NDArray[np.int64] = i[:, None] * coarse.nx + j
+    return out
+
+
 def block_sum(values: NDArray[np.floating] | NDArray[np.integer], k: int) -> NDArray[np.float64]:
     """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)); beyond the edge there is nothing."""
     ny, nx = (-(-n // k) for n in values.shape)

@@ -5,17 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, maximum_filter, uniform_filter
+from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
-from vinemap.geo.raster import Raster, block_sum, cell_of, coarser, grid_over, nearest_cell
+from vinemap.geo.raster import Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
+from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.compute.arrays import Flags, Values
     from vinemap.geo.raster import Grid
 
     Counts = NDArray[np.uint16]
@@ -34,18 +35,12 @@ TOUCHING = 1.4
 """Metres of closed canopy from which rows may touch."""
 ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
-AROUND = 4.0
-"""Metres, about: side of the squares in which the canopies' height is told, from theirs and from those beside them."""
 ABOUT = 6.0
 """Metres about rows that touch in which they are told by where they stand apart."""
 LOWER = 0.05
 """Share of a row's points that reach above that level where it is no lower than those that touch."""
-TOP = 0.97
-"""Order of a square's heights that is its canopies'."""
 FOOT, LEAST = 0.4, 0.2
 """Share of the canopies' height, and metres, from which low canopies are told from what grows beneath them."""
-LOWEST = 0.45
-"""Metres of height below which there is grass and no canopy."""
 RIDGE = 0.75
 """Share of the canopies' height above which rows stand apart that touch below it."""
 
@@ -96,7 +91,7 @@ def canopy_cover(
         Heights from which points count as canopy.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    top = _canopy_height(chm, high)
+    top = height_about(chm, high)
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
@@ -107,32 +102,13 @@ def canopy_cover(
         touching &= ~binary_dilation(wide, _disc(WIDEST, _side(resolution)))
     apart = _apart(touching, body, crown, grid, metres, resolution)
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
-    canopy = np.where(apart.ravel()[_cells_of(metres, grid)], crown, body) if apart.any() else body
+    canopy = np.where(apart.ravel()[cells_in(metres, grid)], crown, body) if apart.any() else body
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
     cover /= blurred + np.float32(0.1 * density)
     cover[_no_vines(everything, canopy, above, resolution)] = 0.0
     return Raster(cover, grid, cloud.crs), levels
-
-
-def _canopy_height(chm: Raster, high: float) -> Values:
-    """Height of the canopies in and beside squares of some metres, in cells of 1 m; 0 where there is nothing."""
-    squares = max(1, round(AROUND / chm.grid.resolution))
-    ny, nx = (-(-n // squares) for n in chm.grid.shape)
-    padded = np.full((ny * squares, nx * squares), np.nan, dtype=np.float32)
-    padded[: chm.grid.ny, : chm.grid.nx] = np.where(chm.values <= high, chm.values, np.nan)
-    inside = padded.reshape(ny, squares, nx, squares).swapaxes(1, 2).reshape(ny, nx, -1)
-    ordered = np.sort(inside, axis=2)
-    n = np.isfinite(ordered).sum(axis=2)
-    rank = np.maximum(np.ceil(TOP * n).astype(int) - 1, 0)
-    top = np.nan_to_num(np.take_along_axis(ordered, rank[:, :, None], axis=2)[:, :, 0])
-    x, y = coarser(chm.grid, resolution=1.0).centres()
-    side = squares * chm.grid.resolution
-    i = np.minimum(((chm.grid.north - y) / side).astype(int), ny - 1)
-    j = np.minimum(((x - chm.grid.west) / side).astype(int), nx - 1)
-    out: Values = maximum_filter(top, 3)[np.ix_(i, j)]
-    return out
 
 
 def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Grid, resolution: float) -> Flags:
@@ -148,20 +124,11 @@ def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Gri
     out[cell_of(np.column_stack([x, y]), metres)] = True
     touch = out.reshape(metres.shape)
     near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (WIDEST, ABOUT))
-    cells = _cells_of(metres, grid).ravel()
+    cells = cells_in(metres, grid).ravel()
     plants, high = (np.bincount(cells, layer.ravel(), metres.ny * metres.nx) for layer in (body, crown))
     lower = (high < LOWER * plants).reshape(metres.shape)
     held: Flags = near | (about & ~lower)
     return held
-
-
-def _cells_of(coarse: Grid, fine: Grid) -> Ints:
-    """Index (ny, nx) of the coarse cell in which each fine one lies."""
-    x, y = fine.centres()
-    i = np.clip(((coarse.north - y) / coarse.resolution).astype(int), 0, coarse.ny - 1)
-    j = np.clip(((x - coarse.west) / coarse.resolution).astype(int), 0, coarse.nx - 1)
-    out: Ints = i[:, None] * coarse.nx + j
-    return out
 
 
 def _counts(cloud: Cloud, grid: Grid, metres: Grid, levels: tuple[Values, Values], high: float) -> Counts:

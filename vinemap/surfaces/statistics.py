@@ -1,20 +1,27 @@
-"""Order statistics of a cloud's heights in cells and blocks of cells, part by part of the cloud."""
+"""Order statistics of a cloud's heights in cells and blocks of cells, part by part of the cloud, and of a raster's."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from vinemap.cloud.bins import quantiles_in
-from vinemap.geo.raster import Grid, Raster, above, window
+from vinemap.geo.raster import Grid, Raster, above, coarser, window
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Floats
+    from vinemap.compute.arrays import Floats, Values
 
 COARSE = 1.0
 """Cell size in metres of the first, coarse surface."""
+LOWEST = 0.45
+"""Metres of height below which there is grass and no canopy."""
+AROUND = 4.0
+"""Metres, about: side of the squares in which the canopies' height is told, from theirs and from those beside them."""
+TOP = 0.97
+"""Order of a square's heights that is its canopies'."""
 
 
 def cells_a_block(resolution: float) -> int:
@@ -39,3 +46,25 @@ def order_statistics(
         here = slice(rows.start // blocks, rows.stop // blocks), slice(columns.start // blocks, columns.stop // blocks)
         n[here], found[:, *here] = quantiles_in(part.bins(around), heights, quantiles, blocks=blocks)
     return n, found
+
+
+def height_about(chm: Raster, high: float, *, order: float = TOP) -> Values:
+    """Height of the canopies in and beside squares of some metres, in cells of 1 m; 0 where there is nothing.
+
+    It is that of an order of a square's heights, up to the greatest that counts.
+    """
+    squares = max(1, round(AROUND / chm.grid.resolution))
+    ny, nx = (-(-n // squares) for n in chm.grid.shape)
+    padded = np.full((ny * squares, nx * squares), np.nan, dtype=np.float32)
+    padded[: chm.grid.ny, : chm.grid.nx] = np.where(chm.values <= high, chm.values, np.nan)
+    inside = padded.reshape(ny, squares, nx, squares).swapaxes(1, 2).reshape(ny, nx, -1)
+    ordered = np.sort(inside, axis=2)
+    n = np.isfinite(ordered).sum(axis=2)
+    rank = np.maximum(np.ceil(order * n).astype(int) - 1, 0)
+    top = np.nan_to_num(np.take_along_axis(ordered, rank[:, :, None], axis=2)[:, :, 0])
+    x, y = coarser(chm.grid, resolution=1.0).centres()
+    side = squares * chm.grid.resolution
+    i = np.minimum(((chm.grid.north - y) / side).astype(int), ny - 1)
+    j = np.minimum(((x - chm.grid.west) / side).astype(int), nx - 1)
+    out: Values = maximum_filter(top, 3)[np.ix_(i, j)]
+    return out

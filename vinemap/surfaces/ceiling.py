@@ -1,0 +1,155 @@
+"""What grows or hangs among vines and is none: strips of a cover crop, and nets through which the vines are seen.
+
+Both are told from the canopy height model. Points above a ceiling are taken out of sight, and rows are sought in the
+others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import (
+    binary_dilation,
+    binary_opening,
+    distance_transform_edt,
+    find_objects,
+    label,
+    maximum_filter,
+    uniform_filter,
+)
+
+from vinemap.geo.raster import Raster, cells_in, coarser
+from vinemap.surfaces.canopy_height import canopy_height_model
+from vinemap.surfaces.statistics import LOWEST, height_about
+
+if TYPE_CHECKING:
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Flags, Ints, Values
+
+LOWER, BROADER, LONG = 0.75, 1.65, 2.0
+"""Height at the most and width at the least of a strip of a cover crop, in those of the rows on both sides of it, and
+its length in its own widths."""
+BOTH_SIDES = 0.2
+"""Share of its length along which a strip has rows on both sides at the least, as there are gaps in rows."""
+MOST = 0.6
+"""Share of what is lower than rows that strips of a cover crop are, where there are any."""
+CORNERS = np.ones((3, 3))
+"""What touches at a corner hangs together."""
+SOIL = 0.2
+"""Metres above ground up to which a strip's points are soil's."""
+FLAT, AIR, FREE = 0.9, 0.8, 0.1
+"""Share of a net's height that all of it reaches, share down to which there is air beneath it, and share of the net
+under which there may be something all the same."""
+WIDE, CLOSED, MESH = 6.0, 0.35, 1.25
+"""Metres across which a net is closed, and share of its cells, in squares of so many metres, that are."""
+BENEATH, THROUGH = 0.1, 0.85
+"""Share of the ground under a net on which vines stand, at the least and at the most."""
+
+
+def heights_of_vines(
+    points: Cloud, dtm: Raster, *, resolution: float = 0.25, high: float = 3.6
+) -> tuple[Cloud, Raster]:
+    """Heights of a cloud's points above ground, without cover crops and nets, and the canopy height model of them.
+
+    Parameters
+    ----------
+    points : PointCloud or TiledCloud
+        The parcel's points.
+    dtm : Raster
+        Terrain.
+    resolution : float
+        Cell size in metres of the canopy height model, that of the terrain.
+    high : float
+        Height in metres above which there are no vines.
+
+    Returns
+    -------
+    cloud : PointCloud or TiledCloud
+        The points with their heights; those of nets and of cover crops are below ground.
+    chm : Raster
+        Canopy height.
+    """
+    cloud = points.above(dtm)
+    chm = canopy_height_model(cloud, resolution=resolution)
+    ceiling = np.full(chm.grid.shape, np.inf, dtype=np.float32)
+
+    def below() -> tuple[Cloud, Raster]:
+        seen = points.above(dtm, replace(chm, values=ceiling))
+        return seen, canopy_height_model(seen, resolution=resolution)
+
+    net = _nets(chm)
+    if net.any():
+        ceiling = np.where(net > 0, FLAT * net, np.inf).astype(np.float32)
+        through, beneath = below()
+        under, net = np.nan_to_num(beneath.values[net > 0]), net[net > 0]
+        if BENEATH <= np.mean(under >= LOWEST) <= THROUGH and np.mean(under > AIR * net) <= FREE:
+            cloud, chm = through, beneath
+        else:
+            ceiling[:] = np.inf
+    crops = _cover_crops(chm, high)
+    if crops.any():
+        ceiling[crops] = SOIL
+        cloud, chm = below()
+    return cloud, chm
+
+
+def _nets(chm: Raster) -> Values:
+    """Height (ny, nx) of what is flat and closed across some metres, 0 elsewhere."""
+    cell = chm.grid.resolution
+    height = height_about(chm, np.inf, order=0.5).ravel()[cells_in(coarser(chm.grid, resolution=1.0), chm.grid)]
+    flat = (height >= LOWEST) & (np.abs(np.nan_to_num(chm.values) - height) <= (1 - FLAT) * height)
+    if np.count_nonzero(flat) * cell**2 < CLOSED * WIDE**2:
+        return np.zeros(chm.grid.shape)
+    closed = uniform_filter(flat.astype(np.float32), max(1, round(MESH / cell))) >= CLOSED
+    middle = distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1] * cell > WIDE / 2
+    if not middle.any():
+        return np.zeros(chm.grid.shape)
+    # What is closed ends before the corners and a ragged edge do.
+    return np.where(flat & (distance_transform_edt(~middle) * cell <= WIDE), height, 0.0)
+
+
+def _cover_crops(chm: Raster, high: float) -> Flags:
+    """Cells (ny, nx) of long strips that are lower and broader than the rows on both sides of them.
+
+    A row of young vines between old ones is lower, too, but no broader.
+    """
+    top = height_about(chm, high).ravel()[cells_in(coarser(chm.grid, resolution=1.0), chm.grid)]
+    out: Flags = np.zeros(chm.grid.shape, dtype=bool)
+    height = np.where(np.isnan(chm.values), maximum_filter(np.nan_to_num(chm.values), 3), chm.values)
+    vines = (top >= LOWEST) & (height >= LOWEST) & (height <= high)
+    tall = vines & (height >= LOWER * top)
+    low = binary_opening(vines & ~tall, CORNERS)
+    strips, width, length, depth = _parts(low)
+    long = (length >= LONG * width) & (width >= BROADER)
+    most = MOST * np.count_nonzero(low)
+    if not (low.any() and np.count_nonzero(long[strips] & low) >= most):
+        return out
+    rows, row_width, row_length, _ = _parts(tall)
+    row = tall & (row_length >= LONG * row_width)[rows]  # and no post
+    if not row.any():
+        return out
+    i, j = np.nonzero(low & (depth >= maximum_filter(depth, 3)))
+    away, nearest = distance_transform_edt(~row, return_indices=True)
+    a, b = nearest[:, i, j]
+    opposite = tuple(np.clip(2 * p - q, 0, n - 1) for p, q, n in zip((i, j), (a, b), low.shape, strict=True))
+    strip, beside = strips[i, j], row_width[rows[a, b]]
+    n = np.maximum(np.bincount(strip, minlength=len(width)), 1)
+    between = np.bincount(strip, away[opposite] <= 0.5 * away[i, j], minlength=len(width)) / n
+    broader = width >= BROADER * np.bincount(strip, beside, minlength=len(width)) / n
+    crops = (long & broader & (between >= BOTH_SIDES))[strips] & low
+    if np.count_nonzero(crops) >= most:
+        out = binary_dilation(crops, CORNERS) & ~tall
+    return out
+
+
+def _parts(mask: Flags) -> tuple[Ints, Values, Values, Values]:
+    """Numbers (ny, nx) of the parts that hang together, their width and length (n + 1,), and cells' depth, in cells."""
+    parts = label(mask, CORNERS)[0]
+    depth = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    n = np.maximum(np.bincount(parts.ravel()), 1)
+    # Cells are 1, 2, …, 2, 1 deep across a part, of which those at both edges are canopy in half.
+    width = 4 * np.bincount(parts.ravel(), depth.ravel()) / n - 3
+    length = [np.hypot(*(side.stop - side.start for side in box)) for box in find_objects(parts)]
+    return parts, width, np.array([0.0, *length]), depth
