@@ -22,7 +22,8 @@ def test_wide_canopies_have_their_middle_between_their_flanks_and_are_followed_t
     of_ridges = ((x > 2) & (x < 14) & (y > -0.1) & (y < 0.7)).astype(np.float32)
     levels = Levels(*(Raster(np.full(metres.shape, level, np.float32), metres, None) for level in (0.5, 1.3)))
     course = gpd.GeoDataFrame(
-        {"spacing_m": [2.4], "alone": [False]}, geometry=[shapely.LineString([(start, 0.3), (end, 0.3)])]
+        {"spacing_m": [2.4], "curtains_m": [0.0], "alone": [False]},
+        geometry=[shapely.LineString([(start, 0.3), (end, 0.3)])],
     )
     dtm = Raster(np.zeros(metres.shape, np.float32), metres, None)
     rows, _ = fit_rows(course, cloud, Raster(of_ridges, fine, None), levels, dtm)
