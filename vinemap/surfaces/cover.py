@@ -35,8 +35,8 @@ TOUCHING = 1.4
 """Metres of closed canopy from which rows may touch."""
 ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
-ABOUT = 6.0
-"""Metres about rows that touch in which they are told by where they stand apart."""
+BESIDE, ABOUT = 3.5, 6.0
+"""Metres about rows that touch in which they are told by where they stand apart, always and unless they are lower."""
 LOWER = 0.05
 """Share of a row's points that reach above that level where it is no lower than those that touch."""
 FOOT, LEAST = 0.4, 0.2
@@ -123,7 +123,7 @@ def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Gri
     x, y = grid.west + (j + 0.5) * _side(resolution), grid.north - (i + 0.5) * _side(resolution)
     out[cell_of(np.column_stack([x, y]), metres)] = True
     touch = out.reshape(metres.shape)
-    near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (WIDEST, ABOUT))
+    near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (BESIDE, ABOUT))
     cells = cells_in(metres, grid).ravel()
     plants, high = (np.bincount(cells, layer.ravel(), metres.ny * metres.nx) for layer in (body, crown))
     lower = (high < LOWER * plants).reshape(metres.shape)
