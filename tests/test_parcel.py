@@ -4,6 +4,7 @@ import json
 import re
 
 import geopandas as gpd
+import laspy
 import numpy as np
 import pygltflib
 import pyogrio
@@ -15,7 +16,8 @@ import trimesh
 from vinemap import paths
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.rows import evaluate_rows
-from vinemap.geo.crs import Origin, main_to_wgs84
+from vinemap.export.write import export_products
+from vinemap.geo.crs import LOCAL, Origin, main_to_wgs84
 from vinemap.parcel import STAGES, call, map_parcel
 from vinemap.product.layers import LAYERS
 from vinemap.simulate.plants import Vineyard
@@ -82,6 +84,31 @@ def test_product_is_the_contracts(product):
     assert [p.name for p in folder.parent.iterdir()] == ["A"]
     listed = [str(name) for name, _ in pyogrio.list_layers(folder / "A.gpkg")]
     assert listed == [*LAYERS, "layer_styles"]
+
+
+def test_local_metres_give_all_but_a_place_on_the_globe(vineyard, tmp_path):
+    near = vineyard.xyz - np.floor(vineyard.xyz.min(axis=0))
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales = np.full(3, 0.001)
+    las = laspy.LasData(header)
+    las.xyz = near
+    las.write(tmp_path / "a.laz")
+    folder = tmp_path / "products" / "A"
+    summary = map_parcel(tmp_path / "a.laz", folder, parcel="A", crs=LOCAL)
+    assert (summary.rows, summary.warnings) == (6, ())
+    rows, ends = (gpd.read_file(folder / "A.gpkg", layer=layer) for layer in ("rows", "row_ends"))
+    assert [column for column in LAYERS["rows"].columns if column not in rows] == [
+        f"{end}_{axis}" for end in ("e1", "en") for axis in ("lat", "lon", "alt")
+    ]
+    record = json.loads((folder / "run.json").read_text())
+    corner = np.array([record["origin"][axis] for axis in "xyz"])
+    first = shapely.get_coordinates(ends.geometry[ends["end"] == "e1"], include_z=True)
+    assert np.allclose(rows[["e1_x", "e1_y", "e1_z"]].to_numpy() + corner, first)
+    assert not (folder / "tileset.json").exists()
+    (told,) = export_products([folder], tmp_path / "out", formats=["nav2", "gazebo", "ply"])
+    assert "6 rows, 5 lanes" in told
+    with pytest.raises(InputError, match=r"its coordinates are local .* take nav2"):
+        list(export_products([folder], tmp_path / "out", formats=["geojson"]))
 
 
 def test_table_2_1_holds_together(product):

@@ -255,12 +255,12 @@ def follow(
         seen = map_rows(points, settings, step=run)
         rows, gaps = seen.rows, seen.gaps
         model = model_canopies(seen, settings, step=run)
-        origin = origin or corner_of(seen.dtm)
+        main = origin or corner_of(seen.dtm)
         sized = summarise_rows(rows, model.table, step=settings.sections.step)
         rows, ends, enhanced = describe_rows(
             judge_canopies(sized, model.table, step=settings.sections.step),
             parcel=parcel,
-            origin=origin,
+            origin=main,
             threshold=settings.curves.threshold,
         )
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=settings.sections.step)
@@ -286,7 +286,7 @@ def follow(
         run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         about: dict[str, Any] = {"n_key_points": seen.n_key_points, "square": seen.field.square}
-        record = record_of(recipe, points, layers, seen.chm, origin=origin, **about)
+        record = record_of(recipe, seen.cloud, layers, seen.chm, origin=main, **about)
         record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {

@@ -242,7 +242,7 @@ def test_chunks_come_in_the_files_order_and_the_file_is_closed(tmp_path, points,
     monkeypatch.setattr(las, "CHUNK", 700)
     path = write_las(tmp_path / "a.laz", points)
     assert np.allclose(read_cloud(path).xyz, points, atol=0.0006)
-    with las.open_cloud(path) as (_, _, chunks):
+    with las.open_cloud(path) as (_, chunks):
         assert len(next(chunks)) == 700
     assert read_cloud(path, boundary=(CORNER, UTM)).size == shapely.contains_xy(CORNER, points[:, :2]).sum()
 

@@ -20,6 +20,7 @@ from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector, TiledCloud
 from vinemap.config.settings import ReadingOptions, Settings
 from vinemap.errors import InputError, OutputError
+from vinemap.geo.place import Place
 from vinemap.geo.raster import grid_over, squares, window
 from vinemap.parcel import call, map_parcel, map_rows, model_canopies
 from vinemap.simulate.survey import write_survey
@@ -169,7 +170,7 @@ def test_strays_are_left_out_as_in_memory(tmp_path):
         (tmp_path / name).mkdir()
         for k in range(0, len(xyz), 50_000):
             collector.add(xyz[k : k + 50_000])
-        clouds.append(collected(collector, UTM, None, tmp_path / "a.laz"))
+        clouds.append(collected(collector, Place(UTM), [tmp_path / "a.laz"]))
     whole, parts = clouds
     assert isinstance(whole, PointCloud)
     assert isinstance(parts, TiledCloud)
@@ -183,7 +184,7 @@ def test_what_is_no_survey_is_refused_in_tiles_too(tmp_path):
     collector = Collector(tmp_path, most=1000)
     collector.add(np.random.default_rng(0).uniform(0, 1e6, (5000, 3)))
     with pytest.raises(InputError, match=r"a\.laz: heights span"):
-        collected(collector, UTM, None, tmp_path / "a.laz")
+        collected(collector, Place(UTM), [tmp_path / "a.laz"])
 
 
 @pytest.mark.parametrize("n", [1, 999, 5000, 20_000])

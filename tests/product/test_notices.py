@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.product.notices import notices
+from vinemap.product.notices import height_notices, notices
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
@@ -156,3 +156,43 @@ def test_why_no_row_was_found(full):
     assert remark == "no row was found in what stands on 910 m² (38% of the parcel): too tall for vines (up to 9 m)"
     (remark,) = notices_of(rows(), full, parcel(), int(AREA * 100), trees, ("too wide", 200.0, 2.1, 12.0))
     assert remark.endswith("9 m); 200 m² closed over 12 m, so that no rows can be told")
+
+
+def at(height, **columns):
+    """A row of 40 m, and canopies of that height along it, 0.6 m wide."""
+    line = shapely.LineString([(WEST + 10, NORTH - 20), (WEST + 50, NORTH - 20)])
+    seen = chm()
+    x, y = np.meshgrid(*seen.grid.centres())
+    seen.values[shapely.contains_xy(line.buffer(0.3), x, y)] = height
+    return rows(1).set_geometry([line], crs=32632).assign(**{"height_m": height} | columns), seen
+
+
+def test_heights_of_vines_need_no_remark():
+    assert height_notices(*at(1.9)) == []
+    assert height_notices(*at(3.4, height_m=3.3)) == []
+
+
+def test_rows_whose_heights_are_not_known():
+    (remark,) = height_notices(*at(0.6, height_m=np.nan))
+    assert remark.startswith("1 of 1 rows have no canopy that could be measured")
+    assert "are heights in metres?" in remark
+
+
+def test_rows_under_something_higher():
+    (remark,) = height_notices(*at(6.2, height_m=3.5))
+    assert remark.startswith("plants are higher than 3.6 m on 100% of the rows")
+
+
+@pytest.mark.parametrize(("height", "told"), [(6.2, "6.2 m high"), (0.002, "0.0 m high"), (190.0, "190.0 m high")])
+def test_no_row_among_heights_that_no_vineyard_has(height, told):
+    seen = chm()
+    seen.values[:, ::4] = height
+    (remark,) = height_notices(rows(), seen)
+    assert told in remark
+    assert "no row" not in remark  # as :func:`notices` says why
+    seen.values[:, ::4] = 1.9
+    assert height_notices(rows(), seen) == []
+
+
+def test_no_points_have_no_heights():
+    assert height_notices(rows(), chm(box(-1, -1, 61, 41))) == []

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-import struct
-from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
 
 from vinemap.cloud.copc import is_copc, points_about
+from vinemap.cloud.files import listed, worded
 from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
-from vinemap.cloud.zones import deal, zones_of
 from vinemap.compute.threads import ahead
 from vinemap.errors import PASSING, BusyError, InputError, OutsideError
 from vinemap.geo.boundaries import Boundary, boundary_in
-from vinemap.geo.crs import check_horizontal, horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
+from vinemap.geo.crs import horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
+from vinemap.geo.place import Place
+from vinemap.geo.stated import check_heights, crs_of, examined
+from vinemap.geo.zones import deal, zones_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Iterator, Sequence
     from pathlib import Path
 
     from pyproj import CRS
@@ -60,19 +62,23 @@ OURS = (InputError, MemoryError, *NOT_THEIRS)
 
 
 def read_cloud(
-    path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None, collector: Collector | None = None
+    clouds: Path | Sequence[Path],
+    *,
+    crs: CRS | None = None,
+    boundary: Boundary | None = None,
+    collector: Collector | None = None,
 ) -> Cloud:
-    """Read a LAS, LAZ or COPC file in chunks into a metric projected CRS, clipped to a polygon.
+    """Read LAS, LAZ or COPC files in chunks into one metric projected CRS, clipped to a polygon.
 
     Points flagged as withheld and points of ASPRS class 7 or 18 (noise) are left out. Of a COPC file only what lies
     about the polygon is read.
 
     Parameters
     ----------
-    path : Path
-        The file.
+    clouds : Path or sequence of Path
+        The file, or files that are read as one: tiles, flights.
     crs : CRS, optional
-        CRS of the file's coordinates; needed where the file states none, and preferred to what it states.
+        CRS of the files' coordinates; needed where they state none, and preferred to what they state.
     boundary : (Geometry, CRS), optional
         Polygon to clip to.
     collector : Collector, optional
@@ -81,18 +87,18 @@ def read_cloud(
     Raises
     ------
     InputError
-        If the file can't be read whole, has no points, no CRS, or coordinates that can't be right.
+        If a file can't be read whole, has no points, no CRS, or coordinates that can't be right.
     """
-    points = collector or Collector()
-    with open_cloud(path, crs=crs, around=boundary) as (target, vertical, chunks):
-        zones = zones_of([boundary_in(boundary, target, path)]) if boundary else None
+    points, files = collector or Collector(), listed(clouds)
+    with open_cloud(files, crs=crs, around=boundary) as (place, chunks):
+        zones = zones_of([boundary_in(boundary, place.crs, files[0])]) if boundary else None
         for xyz in chunks:
             points.add(deal(xyz, zones)[0] if zones else xyz)
-    return collected(points, target, vertical, path)
+    return collected(points, place, files)
 
 
-def collected(points: Collector, crs: CRS, vertical: str | None, path: Path) -> Cloud:
-    """The cloud that was collected from a file, without the few points that lie absurdly far from the rest.
+def collected(points: Collector, place: Place, files: Sequence[Path]) -> Cloud:
+    """The cloud that was collected from files, without the few points that lie absurdly far from the rest.
 
     Raises
     ------
@@ -100,53 +106,59 @@ def collected(points: Collector, crs: CRS, vertical: str | None, path: Path) -> 
         If there are no points, or no survey could have them.
     """
     if points.size == 0:
-        raise _none_inside(path)
-    return points.cloud(crs, vertical, *_plausible(points.sample(100_000), path))
+        raise _none_inside(files)
+    cloud = points.cloud(place.crs, place.vertical, *_plausible(points.sample(100_000), worded(files)))
+    return replace(cloud, remarks=tuple(dict.fromkeys(place.remarks)))
 
 
 @contextmanager
 def open_cloud(
-    path: Path, *, crs: CRS | None = None, around: Boundary | None = None
-) -> Iterator[tuple[CRS, str | None, Iterator[Floats]]]:
-    """Open a LAS, LAZ or COPC file: gives its metric projected CRS, its vertical datum, and chunks of points (n, 3).
+    clouds: Path | Sequence[Path], *, crs: CRS | None = None, around: Boundary | None = None
+) -> Iterator[tuple[Place, Iterator[Floats]]]:
+    """Open LAS, LAZ or COPC files: gives the place of the first in a metric CRS, and chunks of points (n, 3) of all.
 
     Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
     :func:`read_cloud`.
     """
-    with opened(path, crs=crs) as (reader, source, layout):
-        box = _small_box(reader.header, source, around) if around else None
-        found = points_about(path, layout, box, _needed()) if box else None
-        chunks = _usable_chunks(reader, path, found)
+    files, remarks = listed(clouds), list[str]()
+    with closing(_chunks_of(files, crs, around, remarks)) as chunks:
         first = next(chunks, None)
-        if first is None and found is not None:
-            raise _none_inside(path)
         if first is None:
-            raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+            raise _none_inside(files)
         try:
-            target = metric_crs(source, *np.median(first[:, :2], axis=0))
+            target = metric_crs(first.source, *np.median(first.xyz[:, :2], axis=0))
         except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        metric = (_to_metric(xyz, source, target) for xyz in chain([first], chunks))
+            raise InputError(f"{first.path}: {error}") from error
+        place = Place(target, vertical_name(first.source), remarks)
+        metric = (_to_metric(chunk, place, files[0]) for chunk in chain([first], chunks))
         with ahead(metric) as prepared:
-            yield target, vertical_name(source), prepared
+            yield place, prepared
 
 
-def date_of(path: Path) -> datetime | None:
-    """Midnight (UTC) of the day that a file's header states as its date; None if it states none.
+class _Chunk(NamedTuple):
+    """Points (n, 3) of a file in its own CRS."""
 
-    Raises
-    ------
-    OSError
-        If the file can't be read.
-    """
-    with path.open("rb") as stream:
-        head = stream.read(94)
-    if len(head) < 94:
-        return None
-    day, year = struct.unpack("<HH", head[90:])
-    return (
-        datetime(year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1) if 1 <= day <= 366 and 1970 < year < 9999 else None
-    )
+    xyz: Floats
+    source: CRS
+    path: Path
+
+
+def _chunks_of(
+    files: Sequence[Path], crs: CRS | None, around: Boundary | None, remarks: list[str]
+) -> Generator[_Chunk]:
+    """Usable points of files, one after the other, once their first ones were found to be where they can be."""
+    for path in files:
+        with opened(path, crs=crs) as (reader, source, layout):
+            box = _small_box(reader.header, source, around) if around else None
+            found = points_about(path, layout, box, _needed()) if box else None
+            chunks = _usable_chunks(reader, path, found)
+            first = next(chunks, None)
+            if first is None and found is None:
+                raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+            if first is not None:
+                remarks += examined(first, reader.header, source, path)
+                for xyz in chain([first], chunks):
+                    yield _Chunk(xyz, source, path)
 
 
 @contextmanager
@@ -170,7 +182,7 @@ def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS, La
     except BaseException as error:
         raise unreadable(path, error) from error
     with reader:
-        source = crs or _stated_crs(reader.header, path)
+        source = crs_of(reader.header, crs, path)
         _check_header(reader.header, source, path)
         yield reader, source, layout
 
@@ -188,20 +200,6 @@ def _needed() -> Any:
     from laspy import DecompressionSelection as Selection
 
     return Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
-
-
-def _stated_crs(header: Any, path: Path) -> CRS:
-    try:
-        stated: CRS | None = header.parse_crs()
-    except Exception as error:
-        reason = str(error).rpartition("(Internal Proj Error: ")[2][:120].strip(" )")
-        raise InputError(f"{path}: its CRS can't be understood ({reason}): give it with --crs EPSG:n") from error
-    if stated is None:
-        low, high = header.mins, header.maxs
-        degrees = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
-        hint = "--crs EPSG:4326, as they look like degrees" if degrees else "--crs EPSG:n"
-        raise InputError(f"{path}: states no CRS for its coordinates: give it with {hint}")
-    return check_horizontal(stated)
 
 
 def _check_header(header: Any, crs: CRS, path: Path) -> None:
@@ -286,8 +284,10 @@ def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
     return np.clip([*low, -np.inf], *limits), np.clip([*high, np.inf], *limits)
 
 
-def _none_inside(path: Path) -> OutsideError:
-    return OutsideError(f"{path}: no point lies inside the boundary: do both show the same place, in the right CRS?")
+def _none_inside(files: Sequence[Path]) -> OutsideError:
+    return OutsideError(
+        f"{worded(files)}: no point lies inside the boundary: do both show the same place, in the right CRS?"
+    )
 
 
 def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
@@ -311,16 +311,19 @@ def _usable(xyz: Floats, chunk: Any) -> Floats:
     return xyz
 
 
-def _to_metric(xyz: Floats, source: CRS, target: CRS) -> Floats:
-    flat = horizontal(source)
+def _to_metric(chunk: _Chunk, place: Place, first: Path) -> Floats:
+    """Points (n, 3) of a file, in metres of the place of the first."""
+    xyz, source, path = chunk
+    flat, target = horizontal(source), place.crs
     if flat != target:
         xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
         xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    check_heights(source, place, path, first)
     xyz[:, 2] *= vertical_unit(source)
     return xyz
 
 
-def _plausible(sample: Floats, path: Path) -> tuple[Floats, Floats]:
+def _plausible(sample: Floats, of: str) -> tuple[Floats, Floats]:
     """Corners (3,) beyond which a survey, of whose points there is a sample (n, 3), has only strays.
 
     Strays are few, but would stretch every raster.
@@ -328,10 +331,10 @@ def _plausible(sample: Floats, path: Path) -> tuple[Floats, Floats]:
     low, high = np.quantile(sample, [0.002, 0.998], axis=0)
     span = high - low
     if span[2] > LARGEST_RELIEF:
-        raise InputError(f"{path}: heights span {span[2]:.0f} m, which is no survey: check scale, offset and units")
+        raise InputError(f"{of}: heights span {span[2]:.0f} m, which is no survey: check scale, offset and units")
     if span[:2].max() > LARGEST_SPAN:
         raise InputError(
-            f"{path}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check scale, offset and CRS"
+            f"{of}: coordinates span {span[:2].max() / 1000:.0f} km, which is no survey: check scale, offset and CRS"
         )
     reach = 0.5 * span + [50.0, 50.0, 100.0]
     return low - reach, high + reach

@@ -6,25 +6,30 @@ package does it. Everything here asks for that package only when it is called.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import shapely
 
 from vinemap.cloud.copc import is_copc
+from vinemap.cloud.files import listed
 from vinemap.cloud.las import OURS, collected, opened, unreadable
-from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
 from vinemap.geo.boundaries import boundary_in
 from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
+from vinemap.geo.place import Place
+from vinemap.geo.stated import check_heights, examined
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.cloud.points import PointCloud
     from vinemap.geo.boundaries import Boundary
 
 USABLE = "Classification != 7 && Classification != 18 && Withheld == 0"
@@ -73,8 +78,10 @@ def pdal_versions() -> dict[str, str]:
     return {"pdal": str(pdal.__version__), "libpdal": str(pdal.info.version)}
 
 
-def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | None = None) -> PointCloud:
-    """Read a LAS, LAZ or COPC file as :func:`vinemap.cloud.las.read_cloud` does, with PDAL, and classify its ground.
+def read_cloud_pdal(
+    clouds: Path | Sequence[Path], *, crs: CRS | None = None, boundary: Boundary | None = None
+) -> PointCloud:
+    """Read LAS, LAZ or COPC files as :func:`vinemap.cloud.las.read_cloud` does, with PDAL, and classify its ground.
 
     Parameters and what else is raised are those of that function.
 
@@ -89,21 +96,25 @@ def read_cloud_pdal(path: Path, *, crs: CRS | None = None, boundary: Boundary | 
         If PDAL can't be loaded.
     """
     load_pdal()
-    source, target, copc = _look_into(path, crs)
-    polygon = boundary_in(boundary, target, path) if boundary else None
-    reading = reading_pipeline(path, source=source, target=target, polygon=polygon, copc=copc)
-    xyz = _coordinates(_run(reading, path))
-    del reading  # it holds every point with all its dimensions
-    if len(xyz) == 0 and not boundary:
-        raise InputError(f"{path}: holds no usable points (all are flagged as noise)")
-    xyz[:, 2] *= vertical_unit(source)
-    collector = Collector()
-    collector.add(xyz)
-    vertical = vertical_name(source)
-    (cloud,) = collected(collector, target, vertical, path).parts()
-    points = _run(ground_pipeline(cloud.xyz), path)
+    files, collector, remarks = listed(clouds), Collector(), list[str]()
+    place: Place | None = None
+    for path in files:
+        source, target, copc, more = _look_into(path, crs)
+        remarks += more
+        place = place or Place(target, vertical_name(source), remarks)
+        check_heights(source, place, path, files[0])
+        polygon = boundary_in(boundary, place.crs, path) if boundary else None
+        reading = reading_pipeline(path, source=source, target=place.crs, polygon=polygon, copc=copc)
+        xyz = _coordinates(_run(reading, path))
+        del reading  # it holds every point with all its dimensions
+        if len(xyz) == 0 and not boundary:
+            raise InputError(f"{path}: holds no usable points (all are flagged as noise)")
+        xyz[:, 2] *= vertical_unit(source)
+        collector.add(xyz)
+    (cloud,) = collected(collector, cast("Place", place), files).parts()
+    points = _run(ground_pipeline(cloud.xyz), files[0])
     classes = points["Classification"].astype(np.uint8)
-    return PointCloud(_coordinates(points), target, vertical=vertical, classification=classes)
+    return replace(cloud, xyz=_coordinates(points), classification=classes)
 
 
 def reading_pipeline(
@@ -182,8 +193,8 @@ def ground_pipeline(
     return smrf.pipeline(points)
 
 
-def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool]:
-    """CRS of a file's coordinates, CRS to work it in, and whether it is a COPC."""
+def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool, list[str]]:
+    """CRS of a file's coordinates, CRS to work it in, whether it is a COPC, and what is to be known of its place."""
     with opened(path, crs=crs) as (reader, source, _):
         try:
             some = reader.read_points(SAMPLE)
@@ -191,7 +202,9 @@ def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool]:
             raise
         except BaseException as error:
             raise unreadable(path, error) from error
-        return source, metric_crs(source, float(np.median(some.x)), float(np.median(some.y))), is_copc(reader.header)
+        xyz = np.column_stack([some.x, some.y, some.z])
+        target = metric_crs(source, *np.median(xyz[:, :2], axis=0).tolist())
+        return source, target, is_copc(reader.header), examined(xyz, reader.header, source, path)
 
 
 def _run(pipeline: Any, path: Path) -> NDArray[np.void]:

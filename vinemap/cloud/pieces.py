@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vinemap import paths
+from vinemap.cloud.files import listed
 from vinemap.cloud.las import collected, open_cloud
-from vinemap.cloud.zones import deal, zones_of
 from vinemap.errors import InputError
 from vinemap.geo.boundaries import boundary_in
+from vinemap.geo.zones import deal, zones_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,35 +21,35 @@ if TYPE_CHECKING:
 
     from vinemap.cloud.tiles import Cloud, Collector
     from vinemap.geo.boundaries import Boundary
+    from vinemap.geo.place import Place
 
 CHUNK = 1_000_000
 """Points that are read back at once."""
 
 
 class Piece(NamedTuple):
-    """Points (n, 3) in a file of float64, and of which cloud, and in which CRS and vertical datum, they are."""
+    """Points (n, 3) in a file of float64, of which clouds they are, and where."""
 
     path: Path
-    cloud: Path
-    crs: CRS
-    vertical: str | None
+    clouds: Sequence[Path]
+    place: Place
 
 
 def split_cloud(
-    cloud: Path, boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None
+    clouds: Path | Sequence[Path], boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None
 ) -> list[Piece | InputError]:
-    """Read a LAS, LAZ or COPC file once, and give every polygon its points; in several polygons' they go to each.
+    """Read LAS, LAZ or COPC files once, and give every polygon its points; in several polygons' they go to each.
 
     Parameters
     ----------
-    cloud : Path
-        The file.
+    clouds : Path or sequence of Path
+        The files.
     boundaries : sequence of (Geometry, CRS)
         Polygons.
     folder : Path
         Where the files go, 24 bytes a point.
     crs : CRS, optional
-        CRS of the file's coordinates, where it states none or a wrong one.
+        CRS of the files' coordinates, where they state none or a wrong one.
 
     Returns
     -------
@@ -58,30 +59,31 @@ def split_cloud(
     Raises
     ------
     InputError
-        If the file can't be read, as in :func:`vinemap.cloud.las.read_cloud`.
+        If a file can't be read, as in :func:`vinemap.cloud.las.read_cloud`.
     OSError
         If the folder is full.
     """
-    with open_cloud(cloud, crs=crs) as (target, vertical, chunks):
+    files = listed(clouds)
+    with open_cloud(files, crs=crs) as (place, chunks):
         pieces: list[Piece | InputError] = []
-        polygons, files = [], []
+        polygons, drafts = [], []
         for number, boundary in enumerate(boundaries):
             try:
-                polygons.append(boundary_in(boundary, target, cloud))
+                polygons.append(boundary_in(boundary, place.crs, files[0]))
             except InputError as error:
                 pieces.append(error)
             else:
-                files.append(paths.piece(folder, number))
-                pieces.append(Piece(files[-1], cloud, target, vertical))
+                drafts.append(paths.piece(folder, number))
+                pieces.append(Piece(drafts[-1], files, place))
         if not polygons:
             return pieces
         zones = zones_of(polygons)
-        for path in files:
+        for path in drafts:
             path.touch()
         for chunk in chunks:
             xyz, start = deal(chunk, zones)
             for k in np.flatnonzero(np.diff(start)):
-                with files[k].open("ab") as stream:
+                with drafts[k].open("ab") as stream:
                     stream.write(xyz[start[k] : start[k + 1]].data)
     return pieces
 
@@ -97,4 +99,4 @@ def read_piece(piece: Piece, collector: Collector) -> Cloud:
     with piece.path.open("rb") as stream:
         while len(xyz := np.fromfile(stream, count=3 * CHUNK).reshape(-1, 3)):
             collector.add(xyz)
-    return collected(collector, piece.crs, piece.vertical, piece.cloud)
+    return collected(collector, piece.place, piece.clouds)

@@ -31,7 +31,8 @@ class PointCloud:
 
     ``vertical`` names the vertical datum that the file states; heights are never moved to another. ``heights`` (n,)
     are metres above the terrain model, once there is one; ``first`` is the index of its first point in a larger cloud.
-    ``classification`` (n,) holds ASPRS classes, where the engine that read the points gives them.
+    ``classification`` (n,) holds ASPRS classes, where the engine that read the points gives them. ``remarks`` are what
+    is to be known of its files.
     """
 
     xyz: Floats
@@ -40,6 +41,7 @@ class PointCloud:
     heights: Values = field(default_factory=lambda: np.empty(0, dtype=np.float32))
     first: int = 0
     classification: NDArray[np.uint8] | None = None
+    remarks: tuple[str, ...] = ()
     _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property

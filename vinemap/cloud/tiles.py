@@ -51,6 +51,7 @@ class TiledCloud:
     vertical: str | None = None
     dtm: Raster | None = None
     ceiling: Raster | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:

@@ -15,7 +15,7 @@ from pyogrio.errors import DataLayerError, DataSourceError
 from vinemap import paths
 from vinemap.errors import InputError
 from vinemap.export.lanes import lanes_between
-from vinemap.geo.crs import WGS84, Origin, to_main
+from vinemap.geo.crs import WGS84, Corner, Origin, is_local, origin_of, to_main
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,7 +34,7 @@ class Field(NamedTuple):
     """Date of the survey, as 2026-05-31."""
     key: str
     """That of the product's recipe."""
-    origin: Origin
+    origin: Origin | Corner
     rows: gpd.GeoDataFrame
     lanes: gpd.GeoDataFrame
     """Of :func:`vinemap.export.lanes.lanes_between`; empty if they weren't asked for."""
@@ -44,11 +44,26 @@ class Field(NamedTuple):
     """Layer ``parcel`` of the product."""
 
     def wgs84(self, layer: str) -> gpd.GeoDataFrame:
-        """One of the layers in longitude and latitude, to a tenth of a millimetre; heights stay, to a millimetre."""
+        """One of the layers in longitude and latitude, to a tenth of a millimetre; heights stay, to a millimetre.
+
+        Raises
+        ------
+        InputError
+            If its coordinates are local.
+        """
+        self.check_placed()
         frame: gpd.GeoDataFrame = getattr(self, layer).to_crs(WGS84)
         shapes, high = frame.geometry.to_numpy(), bool(frame.has_z.all())
         shapes = shapely.transform(shapes, lambda xyz: np.c_[xyz[:, :2].round(9), xyz[:, 2:].round(3)], include_z=high)
         return frame.set_geometry(gpd.GeoSeries(shapes, index=frame.index, crs=WGS84))
+
+    def check_placed(self) -> None:
+        """Make sure that the parcel has a place on the globe; InputError if its coordinates are local."""
+        if is_local(self.rows.crs):
+            raise InputError(
+                f"{self.parcel}: its coordinates are local, but this format wants latitude and longitude: "
+                "take nav2, opennav_coverage, gazebo, ply or obj"
+            )
 
     def guidance(self, lines: str) -> gpd.GeoDataFrame:
         """``label``, ``kind`` ("lane", "row"), ``width_m`` (of the lane, or the rows' spacing) of chosen lines."""
@@ -88,7 +103,7 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     folder = product if product.is_dir() else product.parent
     try:
         record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        parcel, origin = str(record["parcel"]), Origin(**record["origin"])
+        parcel, origin = str(record["parcel"]), origin_of(record["origin"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{paths.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, or its GeoPackage"

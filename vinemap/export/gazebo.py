@@ -13,13 +13,12 @@ from vinemap import paths
 from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
 from vinemap.export.meshes import place_canopies, write_obj
-from vinemap.geo.crs import to_main
+from vinemap.geo.crs import Corner, Origin, to_main
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vinemap.export.field import Field
-    from vinemap.geo.crs import Origin
 
 TERRAIN_CELL = 1.0
 """Metres, about, between the vertices of the terrain."""
@@ -52,9 +51,7 @@ MODEL = """<?xml version="1.0"?>
   </model>
 </sdf>
 """
-WORLD = """<?xml version="1.0"?>
-<sdf version="1.9">
-  <world name="{model}">
+SPHERE = """
     <spherical_coordinates>
       <surface_model>EARTH_WGS84</surface_model>
       <world_frame_orientation>ENU</world_frame_orientation>
@@ -62,7 +59,10 @@ WORLD = """<?xml version="1.0"?>
       <longitude_deg>{lon!r}</longitude_deg>
       <elevation>{alt!r}</elevation>
       <heading_deg>0</heading_deg>
-    </spherical_coordinates>
+    </spherical_coordinates>"""
+WORLD = """<?xml version="1.0"?>
+<sdf version="1.9">
+  <world name="{model}">{sphere}
     <light type="directional" name="sun">
       <direction>-0.5 0.3 -0.8</direction>
     </light>
@@ -75,7 +75,8 @@ WORLD = """<?xml version="1.0"?>
 def write_gazebo(field: Field, folder: Path) -> None:
     """Write a product as a static model for Gazebo, terrain and canopies as OBJ, and a world that holds it.
 
-    The world's frame is {Main}, and its spherical coordinates are {Main}'s origin, so that a robot's GNSS is right.
+    The world's frame is {Main}, and its spherical coordinates are {Main}'s origin, so that a robot's GNSS is right;
+    there are none where coordinates are local.
 
     Raises
     ------
@@ -102,7 +103,8 @@ def write_gazebo(field: Field, folder: Path) -> None:
     title = escape(f"Vineyard {field.parcel}")
     (model / paths.MODEL_CONFIG).write_text(CONFIG.format(title=title), encoding="utf-8")
     (model / paths.MODEL).write_text(MODEL.format(model=name, links=links), encoding="utf-8")
-    world = WORLD.format(model=name, **field.origin._asdict())
+    sphere = SPHERE.format(**field.origin._asdict()) if isinstance(field.origin, Origin) else ""
+    world = WORLD.format(model=name, sphere=sphere)
     paths.gazebo_world(folder, name).write_text(world, encoding="utf-8")
 
 
@@ -110,7 +112,7 @@ def _faces(meshes: list[Mesh]) -> bool:
     return any(len(mesh.faces) for mesh in meshes)
 
 
-def terrain_mesh(dtm: Path, origin: Origin, *, cell: float = TERRAIN_CELL) -> Mesh:
+def terrain_mesh(dtm: Path, origin: Origin | Corner, *, cell: float = TERRAIN_CELL) -> Mesh:
     """A raster of elevations as a mesh in {Main}, facing up, a vertex every ``cell`` metres about.
 
     Raises

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vinemap import paths
-from vinemap.geo.crs import to_main
+from vinemap.geo.crs import is_local, to_main
 from vinemap.product.gltf import read_glb
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ def place_canopies(field: Field, *, grid: bool = False) -> Placed:
     if grid:
         about |= {"frame": f"{found.crs.to_string()} less the offset", "offset": found.origin.tolist()}
     else:
-        about |= {"frame": "{Main}, topocentric at the origin (WGS84)", "origin": field.origin._asdict()}
+        frame = "{Main}, local" if is_local(found.crs) else "{Main}, topocentric at the origin (WGS84)"
+        about |= {"frame": frame, "origin": field.origin._asdict()}
 
     def place(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
         return vertices - found.origin if grid else to_main(vertices, found.crs, field.origin)

@@ -23,8 +23,18 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
 
 WGS84 = CRS.from_epsg(4326)
+LOCAL = CRS.from_wkt(
+    'ENGCRS["local metres",EDATUM["unknown"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+)
+"""Metres about a point that nobody has placed on the globe, x east and y north; ``local`` in words."""
 ELLIPSOIDAL = "ellipsoidal height"
 """What stands for the vertical datum of a CRS whose third axis is the height above its ellipsoid."""
+UNKNOWN = "unknown"
+"""Name of a vertical CRS of which only the unit is stated."""
+SAME = 0.001
+"""Metres within which coordinates are the same."""
+SAME_DEGREES = 1e-7
+"""The same, of places: a centimetre."""
 SCALE_TOLERANCE = 0.002
 """A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
 
@@ -35,6 +45,24 @@ class Origin(NamedTuple):
     lat: float
     lon: float
     alt: float
+
+
+class Corner(NamedTuple):
+    """Origin of {Main} in local coordinates, in metres; there {Main} is their own frame, shifted."""
+
+    x: float
+    y: float
+    z: float
+
+    @property
+    def alt(self) -> float:
+        """Its height (m), as an :class:`Origin` tells it."""
+        return self.z
+
+
+def origin_of(numbers: dict[str, float]) -> Origin | Corner:
+    """Origin of {Main} as a product's record has it; TypeError if it is none."""
+    return Corner(**numbers) if "x" in numbers else Origin(**numbers)
 
 
 def check_origin(origin: Origin) -> Origin:
@@ -54,13 +82,15 @@ def check_origin(origin: Origin) -> Origin:
 
 
 def parse_crs(text: str) -> CRS:
-    """Read a CRS as a user writes it (``EPSG:32632``, ``32632``, WKT, PROJ).
+    """Read a CRS as a user writes it (``EPSG:32632``, ``32632``, WKT, PROJ, ``local``).
 
     Raises
     ------
     InputError
         If PROJ doesn't know it.
     """
+    if text.strip().lower() == "local":
+        return LOCAL
     try:
         crs = CRS.from_user_input(int(text) if text.strip().isdigit() else text)
     except CRSError as error:
@@ -69,29 +99,86 @@ def parse_crs(text: str) -> CRS:
 
 
 def check_horizontal(crs: CRS) -> CRS:
-    """Return a CRS that places points on the map: projected or geographic, with heights or not.
+    """Return a CRS that places points on the map: projected, geographic or local, with heights or not.
 
     Raises
     ------
     InputError
-        If it does neither (geocentric, vertical alone).
+        If it does none of that (geocentric, vertical alone).
     """
-    if not (crs.is_projected or crs.is_geographic):
+    if not (crs.is_projected or crs.is_geographic or is_local(crs)):
         raise InputError(f"{crs.name} is neither projected nor geographic: give the cloud's CRS with --crs EPSG:n")
     return crs
 
 
+def is_local(crs: CRS) -> bool:
+    """Whether a CRS has no place on the globe."""
+    return crs.is_engineering
+
+
+@lru_cache(maxsize=32)
 def horizontal(crs: CRS) -> CRS:
-    """Return the two-dimensional part of a CRS, which is all that GeoPackage and GeoTIFF keep well."""
-    flat = crs.sub_crs_list[0] if crs.is_compound else crs
-    return flat.to_2d()
+    """Return the two-dimensional part of a CRS, which is all that GeoPackage and GeoTIFF keep well.
+
+    A shift to WGS 84 that is stated beside it (TOWGS84) counts where the CRS has no code; one that has is kept in files
+    by its code, and means there what PROJ makes of it.
+    """
+    flat = stated(crs)
+    code = _stated_code(unbound(flat)) or code_of(unbound(flat)) if flat.is_bound else None
+    return CRS.from_authority(*code) if code else flat
+
+
+def stated(crs: CRS) -> CRS:
+    """The two-dimensional part of a CRS, with the shift to WGS 84 that is stated beside it, if there is one."""
+    return (crs.sub_crs_list[0] if crs.is_compound and crs.sub_crs_list else crs).to_2d()
+
+
+def unbound(crs: CRS) -> CRS:
+    """A CRS without the shift to another that is stated beside it."""
+    return crs.source_crs if crs.is_bound and crs.source_crs else crs
+
+
+def _stated_code(crs: CRS) -> tuple[str, str] | None:
+    """Authority and code that a CRS states itself, if they are those of a CRS that gives the same coordinates."""
+    code = [str(part) for part in (crs.to_json_dict().get("id") or {}).values()]
+    try:
+        known = CRS.from_authority(*code) if len(code) == 2 else None
+        if known is None or (area := known.area_of_use) is None:
+            return None
+        middle = (area.west + area.east) / 2, (area.south + area.north) / 2
+        there, here = (transformer(known.geodetic_crs, one).transform(*middle) for one in (known, crs))
+    except (CRSError, ProjError):
+        return None
+    return (code[0], code[1]) if np.allclose(there, here, rtol=0, atol=SAME) else None
+
+
+@lru_cache(maxsize=32)
+def code_of(crs: CRS) -> tuple[str, str] | None:
+    """Authority and code by which a CRS is known, as ("EPSG", "32632")."""
+    code: tuple[str, str] | None = crs.to_authority(min_confidence=70)
+    return code
+
+
+def vertical(crs: CRS) -> CRS | None:
+    """The vertical part of a compound CRS, or None."""
+    return unbound(crs.sub_crs_list[1]) if crs.is_compound and crs.sub_crs_list else None
 
 
 def vertical_name(crs: CRS) -> str | None:
-    """Name of the vertical datum that a CRS states, or None."""
-    if crs.is_compound:
-        return crs.sub_crs_list[1].name
+    """Name of the vertical datum that a CRS states, as it is called where heights are in metres, or None."""
+    if up := vertical(crs):
+        return None if up.name == UNKNOWN else _in_metres(up.name)
     return ELLIPSOIDAL if len(crs.axis_info) > 2 else None
+
+
+@lru_cache(maxsize=32)
+def _in_metres(name: str) -> str:
+    """Name of a vertical CRS without the feet in it, if it is known by that."""
+    plain = name.removesuffix(" (ftUS)").removesuffix(" (ft)")
+    try:
+        return plain if CRS.from_user_input(plain).is_vertical else name
+    except CRSError:
+        return name
 
 
 def is_ellipsoidal(vertical: str) -> bool:
@@ -105,8 +192,8 @@ def vertical_unit(crs: CRS) -> float:
     A CRS without heights of its own is taken to measure them in its horizontal unit (state-plane feet),
     and in metres where that unit is an angle.
     """
-    if crs.is_compound:
-        return float(crs.sub_crs_list[1].axis_info[0].unit_conversion_factor)
+    if up := vertical(crs):
+        return float(up.axis_info[0].unit_conversion_factor)
     if len(crs.axis_info) > 2:
         return float(crs.axis_info[2].unit_conversion_factor)
     return 1.0 if crs.is_geographic else float(crs.axis_info[0].unit_conversion_factor)
@@ -115,8 +202,8 @@ def vertical_unit(crs: CRS) -> float:
 def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     """Choose the projected CRS in metres in which a cloud around (x, y) is worked.
 
-    The cloud's own horizontal CRS where it is projected, metric and true to scale there; else the UTM
-    zone of the point.
+    The cloud's own horizontal CRS where it is local, or projected, metric, true to scale there, and such that files
+    keep it as it is; else the UTM zone of the point.
 
     Parameters
     ----------
@@ -126,6 +213,8 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
         A point of the cloud, in ``crs``, x east.
     """
     flat = horizontal(crs)
+    if is_local(flat):
+        return flat
     try:
         lon, lat = transformer(flat, WGS84).transform(x, y)
     except ProjError as error:
@@ -133,12 +222,21 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     if not (np.isfinite(lon) and np.isfinite(lat)):
         raise InputError(f"coordinates ({x:.1f}, {y:.1f}) don't lie in {flat.name}: give the right one with --crs")
     axes = {axis.direction for axis in flat.axis_info[:2]}
-    if flat.is_projected and flat.axis_info[0].unit_conversion_factor == 1.0 and axes == {"east", "north"}:
+    metric = flat.is_projected and flat.axis_info[0].unit_conversion_factor == 1.0
+    if metric and not flat.is_bound and axes == {"east", "north"}:
         factors = Proj(flat).get_factors(lon, lat)
         if max(abs(factors.meridional_scale - 1), abs(factors.parallel_scale - 1)) < SCALE_TOLERANCE:
-            return flat
+            kept = Transformer.from_crs(_in_files(flat), WGS84, always_xy=True).transform(x, y)
+            if max(abs(kept[0] - lon), abs(kept[1] - lat)) < SAME_DEGREES:
+                return flat
     zone = int((lon + 180) // 6) % 60 + 1
     return CRS.from_epsg((32600 if lat >= 0 else 32700) + zone)
+
+
+def _in_files(flat: CRS) -> CRS:
+    """What is read of a CRS after it was written: the one of the code by which it goes, or of its name and numbers."""
+    code = flat.to_epsg()
+    return CRS.from_epsg(code) if code else CRS.from_wkt(flat.to_wkt("WKT1_GDAL"))
 
 
 @lru_cache(maxsize=32)
@@ -163,6 +261,8 @@ def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geom
     InputError
         If nothing leads from one to the other.
     """
+    if is_local(source) and is_local(target):
+        return shapely.force_2d(polygon)
     try:
         convert = transformer(horizontal(source), target).transform
     except ProjError as error:
@@ -171,16 +271,21 @@ def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geom
 
 
 def to_wgs84(xyz: ArrayLike, crs: CRS) -> NDArray[np.float64]:
-    """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in a projected CRS."""
+    """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in a projected CRS; NaN in a local one.
+
+    Between datums the height has its part in the way, by some centimetres a kilometre, as in programs that read layers.
+    """
     points = np.atleast_2d(np.asarray(xyz, dtype=float))
-    lon, lat = transformer(crs, WGS84).transform(points[:, 0], points[:, 1])
+    if is_local(crs):
+        return np.full(points.shape, np.nan)
+    lon, lat, _ = transformer(crs, WGS84).transform(*points.T)
     return np.column_stack([lat, lon, points[:, 2]])
 
 
 def from_wgs84(lat_lon_alt: ArrayLike, crs: CRS) -> NDArray[np.float64]:
     """Points (n, 3) in a projected CRS from latitude, longitude (degrees) and altitude (m)."""
     points = np.atleast_2d(np.asarray(lat_lon_alt, dtype=float))
-    x, y = transformer(WGS84, crs).transform(points[:, 1], points[:, 0])
+    x, y, _ = transformer(WGS84, crs).transform(points[:, 1], points[:, 0], points[:, 2])
     return np.column_stack([x, y, points[:, 2]])
 
 
@@ -201,8 +306,11 @@ def main_to_wgs84(xyz: ArrayLike, origin: Origin) -> NDArray[np.float64]:
     return np.column_stack([lat, lon, alt])
 
 
-def to_main(xyz: ArrayLike, crs: CRS, origin: Origin) -> NDArray[np.float64]:
-    """Points (n, 3) of a projected CRS in {Main}."""
+def to_main(xyz: ArrayLike, crs: CRS, origin: Origin | Corner) -> NDArray[np.float64]:
+    """Points (n, 3) of a projected or local CRS in {Main}."""
+    if isinstance(origin, Corner):
+        moved: NDArray[np.float64] = np.atleast_2d(np.asarray(xyz, dtype=float)) - np.array(origin)
+        return moved
     return wgs84_to_main(to_wgs84(xyz, crs), origin)
 
 
@@ -210,11 +318,14 @@ FARTHEST = 50_000.0
 """Metres from the origin of {Main}, a plane that the globe leaves by then."""
 
 
-def corner_of(dtm: Raster) -> Origin:
+def corner_of(dtm: Raster) -> Origin | Corner:
     """Origin of {Main} where none is given: the south-western corner of the terrain, at its lowest elevation."""
     grid = dtm.grid
     south = grid.north - grid.ny * grid.resolution
-    lat, lon, alt = to_wgs84([grid.west, south, float(np.floor(np.nanmin(dtm.values)))], dtm.crs)[0]
+    corner = Corner(grid.west, south, float(np.floor(np.nanmin(dtm.values))))
+    if is_local(dtm.crs):
+        return corner
+    lat, lon, alt = to_wgs84(corner, dtm.crs)[0]
     return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
 
 
@@ -226,5 +337,7 @@ def check_near(origin: Origin, point: Floats, crs: CRS) -> None:
     InputError
         If it doesn't.
     """
+    if is_local(crs):
+        raise InputError("local coordinates have no latitude and longitude: leave the origin out")
     if np.abs(to_main(point[None], crs, origin)[0, :2]).max() > FARTHEST:
         raise InputError(f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first")

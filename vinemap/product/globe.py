@@ -17,7 +17,7 @@ import numpy as np
 from pyproj import CRS
 
 import vinemap
-from vinemap.geo.crs import to_wgs84, transformer
+from vinemap.geo.crs import is_local, to_wgs84, transformer
 from vinemap.geo.geoid import find_geoid
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def parcel_tileset(
     vertical: str | None,
     geoid: float | None = None,
 ) -> dict[str, Any] | None:
-    """Describe a parcel's canopies as a tileset of one tile; None where there are none.
+    """Describe a parcel's canopies as a tileset of one tile; None where there are none, or no place on the globe.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def parcel_tileset(
         As for :func:`vinemap.geo.geoid.find_geoid`.
     """
     meshes = [mesh for mesh in meshes if len(mesh.faces)]
-    if not meshes:
+    if not meshes or is_local(crs):
         return None
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
     ends = np.vstack([origin, vertices.min(axis=0), vertices.max(axis=0)])

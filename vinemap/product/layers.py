@@ -8,7 +8,7 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.geo.crs import project
+from vinemap.geo.crs import is_local, project
 from vinemap.rows.blocks import outline_blocks
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 TEXT, WHOLE, REAL, TIME = "str", "int64", "float64", "datetime64[ms, UTC]"
 _END = ("x", "y", "z"), ("lat", "lon", "alt")
 _ROW = {"row_id": WHOLE, "label": TEXT}
+GLOBAL = {f"{end}_{axis}" for end in ("e1", "en") for axis in _END[1]}
+"""Columns of WGS 84."""
 
 
 class Layer(NamedTuple):
@@ -75,12 +77,15 @@ LAYERS: dict[str, Layer] = {
 def conform(frame: gpd.GeoDataFrame, layer: str, *, contract: Mapping[str, Layer] = LAYERS) -> gpd.GeoDataFrame:
     """Bring a table to the columns of a layer of a contract, in order and with their types.
 
+    Those of WGS 84 are left out where coordinates are local.
+
     Raises
     ------
     ValueError
         If a column is missing.
     """
-    columns = contract[layer].columns
+    local = frame.crs is not None and is_local(frame.crs)
+    columns = {name: kind for name, kind in contract[layer].columns.items() if not (local and name in GLOBAL)}
     missing = sorted(set(columns) - set(frame.columns))
     if missing:
         raise ValueError(f"layer {layer} lacks {', '.join(missing)}")

@@ -26,6 +26,14 @@ SURE = 0.5
 """Confidence of a row that is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
+LOWEST, HIGHEST = 0.45, 3.6
+"""Metres of height from which what stands there is no grass, and up to which it may be vines."""
+STEP = 0.5
+"""Metres between the points of rows."""
+TOP = 0.98
+"""Order of the height to which plants stand."""
+MUCH = 0.2
+"""Share of the rows' length on which trees don't hang over them."""
 MOST_LEFT = 0.02
 """Share of a parcel on which something may stand that is in no row and might be vines."""
 MAIN = 0.1
@@ -110,6 +118,28 @@ def _reasons(unmapped: gpd.GeoDataFrame) -> str:
     if len(told) > 1:
         told = [f"{area:,.0f} m² {one}" for one, area in zip(told, main, strict=True)]
     return "; ".join(told)
+
+
+def height_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
+    """Remarks on heights that no vineyard has, as where feet were read as metres; parameters as of :func:`notices`."""
+    known = chm.values[np.isfinite(chm.values)]
+    unit = "are heights in metres? Their unit is told by --crs EPSG:n+m"
+    if len(rows) == 0:
+        top = float(np.quantile(known, TOP)) if len(known) else LOWEST
+        if LOWEST <= top <= HIGHEST:
+            return []
+        return [f"what stands there is up to {top:.1f} m high; if that can't be, {unit}"]
+    lacking = int(rows["height_m"].isna().sum())
+    grid = chm.grid
+    x, y = shapely.get_coordinates(shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP)).T
+    i, j = ((grid.north - y) / grid.resolution).astype(int), ((x - grid.west) / grid.resolution).astype(int)
+    over = np.mean(chm.values[np.clip(i, 0, grid.ny - 1), np.clip(j, 0, grid.nx - 1)] > HIGHEST)
+    remarks = {
+        f"{lacking} of {len(rows)} rows have no canopy that could be measured; if many should, {unit}": lacking > 0,
+        f"plants are higher than {HIGHEST:g} m on {over:.0%} of the rows, and measured only so far; {unit}": over
+        > MUCH,
+    }
+    return [remark for remark, holds in remarks.items() if holds]
 
 
 def _covered(polygon: shapely.Geometry, seen: NDArray[np.bool_], grid: Grid, side: float) -> float:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import shapely
 
 from vinemap import __version__, paths
-from vinemap.cloud.las import date_of
+from vinemap.cloud.files import date_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import read_boundary
@@ -126,6 +126,8 @@ class Recipe(NamedTuple):
     """For the record: a file that is only touched makes no other product."""
     survey: str | None = None
     """Name of the survey whose parcels' products lie side by side."""
+    remarks: tuple[str, ...] = ()
+    """What is to be known of the boundary: a sentence each."""
 
     @property
     def key(self) -> str:

@@ -6,15 +6,18 @@ import platform
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+import shapely
+
 from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
-from vinemap.product.notices import notices
+from vinemap.geo.place import doubts_of
+from vinemap.product.notices import height_notices, notices
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.geo.crs import Origin
+    from vinemap.geo.crs import Corner, Origin
     from vinemap.geo.raster import Raster
     from vinemap.product.recipe import Recipe
 
@@ -31,7 +34,7 @@ def record_of(
     layers: dict[str, gpd.GeoDataFrame],
     chm: Raster,
     *,
-    origin: Origin,
+    origin: Origin | Corner,
     n_key_points: int,
     square: bool = False,
 ) -> dict[str, Any]:
@@ -47,7 +50,7 @@ def record_of(
         Those of the GeoPackage.
     chm : Raster
         Canopy height, NaN where there are no points.
-    origin : Origin
+    origin : Origin or Corner
         Of {Main}.
     n_key_points : int
         Key points that were found.
@@ -73,6 +76,18 @@ def record_of(
         "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
-        "warnings": notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size) + [SQUARE] * square,
+        "warnings": _places(recipe, points)
+        + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
+        + height_notices(layers["rows"], chm)
+        + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }
+
+
+def _places(recipe: Recipe, points: Cloud) -> list[str]:
+    """What is to be known of where points and boundary are."""
+    known = [*points.remarks, *recipe.remarks]
+    if recipe.boundary:
+        polygon, crs = recipe.boundary
+        known += doubts_of(crs, *shapely.get_coordinates(polygon)[0].tolist())
+    return list(dict.fromkeys(known))

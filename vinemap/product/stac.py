@@ -24,7 +24,7 @@ from pystac.extensions.projection import ProjectionExtension
 
 from vinemap import __version__, paths
 from vinemap.evaluate.unmapped import TALL
-from vinemap.geo.crs import WGS84, project
+from vinemap.geo.crs import WGS84, is_local, project
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def parcel_item(
     polygon : Polygon or MultiPolygon
         The parcel's, in ``crs``.
     crs : CRS
-        The product's projected CRS.
+        The product's projected CRS, or a local one, which leaves the item without a place.
     properties : mapping
         Numbers and words to be found under ``vinemap:<name>``; those without a value (None, NaN) are left out.
     survey : str, optional
@@ -86,14 +86,12 @@ def parcel_item(
     OSError
         If a raster can't be read.
     """
-    # Normal is clockwise, RFC 7946 wants the opposite; its eighth decimal is a millimetre.
-    outline = shapely.reverse(shapely.normalize(project(polygon, crs, WGS84)))
-    outline = shapely.transform(outline, lambda lon_lat: np.round(lon_lat, 8))
+    outline = None if is_local(crs) else _outline(polygon, crs)
     known = {name: value.item() if isinstance(value, np.generic) else value for name, value in properties.items()}
     item = pystac.Item(
         id=f"{survey}-{parcel}" if survey else parcel,
-        geometry=json.loads(shapely.to_geojson(outline)),
-        bbox=shapely.bounds(outline).tolist(),
+        geometry=json.loads(shapely.to_geojson(outline)) if outline else None,
+        bbox=shapely.bounds(outline).tolist() if outline else None,
         datetime=flown.astimezone(UTC),
         properties={"title": parcel} | {f"vinemap:{name}": value for name, value in known.items() if _has_value(value)},
     )
@@ -127,6 +125,12 @@ def parcel_item(
         source = _href(paths.stac_item(above, survey), folder)
         item.add_link(Link(RelType.DERIVED_FROM, source, MediaType.GEOJSON, survey))
     return item
+
+
+def _outline(polygon: shapely.Geometry, crs: CRS) -> shapely.Geometry:
+    """A polygon in WGS 84: normal is clockwise, RFC 7946 wants the opposite; its eighth decimal is a millimetre."""
+    outline = shapely.reverse(shapely.normalize(project(polygon, crs, WGS84)))
+    return shapely.transform(outline, lambda lon_lat: np.round(lon_lat, 8))
 
 
 def _has_value(value: object) -> bool:

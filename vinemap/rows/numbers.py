@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.geo.crs import WGS84, Origin, to_main, to_wgs84
+from vinemap.geo.crs import WGS84, Corner, Origin, is_local, to_main, to_wgs84
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats, Ints
@@ -82,17 +82,17 @@ def _order_across(rows: gpd.GeoDataFrame) -> Ints:
 
 
 def describe_rows(
-    rows: gpd.GeoDataFrame, *, parcel: str, origin: Origin, threshold: float = 2.0
+    rows: gpd.GeoDataFrame, *, parcel: str, origin: Origin | Corner, threshold: float = 2.0
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Describe numbered rows as Table 2.1 does.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineStringZ in a projected CRS with ``row_id``.
+        LineStringZ in a projected or local CRS with ``row_id``.
     parcel : str
         Name that follows the number in a row's label ("1 F").
-    origin : Origin
+    origin : Origin or Corner
         Origin of {Main}.
     threshold : float
         Metres t between enhanced key points, which stand at equal distances of about that along γ.
@@ -103,9 +103,9 @@ def describe_rows(
         With ``label``, ``length_m`` (3-D), ``orientation_deg`` (mean, anticlockwise from {Main}'s west–east
         axis, which is true and not the grid's, in (-90, 90]), ``elevation_m`` (mean along the row),
         ``elevation_diff_m`` (en − e1), ``n_key_points``, and both ends as ``e1_x`` … ``en_z`` in
-        {Main} and ``e1_lat`` … ``en_alt`` in WGS84.
+        {Main} and ``e1_lat`` … ``en_alt`` in WGS84, NaN where coordinates are local.
     row_ends : GeoDataFrame
-        PointZ in EPSG:4326 with ``row_id``, ``label``, ``end`` ("e1" or "en").
+        PointZ in EPSG:4326, or the local CRS, with ``row_id``, ``label``, ``end`` ("e1" or "en").
     key_points : GeoDataFrame
         PointZ with ``row_id``, ``label``, ``order`` (1 … n) and ``position_m`` along γ.
     """
@@ -133,8 +133,8 @@ def describe_rows(
             "label": np.repeat(np.array(labels, dtype=object), 2),
             "end": ["e1", "en"] * len(rows),
         },
-        geometry=gpd.points_from_xy(wgs84[:, 1], wgs84[:, 0], wgs84[:, 2]),
-        crs=WGS84,
+        geometry=gpd.points_from_xy(*(ends if is_local(rows.crs) else wgs84[:, [1, 0, 2]]).T),
+        crs=rows.crs if is_local(rows.crs) else WGS84,
     )
     return rows.assign(**table), row_ends, _key_points(rows, labels, n_points)
 

@@ -94,6 +94,7 @@ def parcel_page(
     zero = np.array([grid.west, grid.north - grid.ny * grid.resolution])
     picture, across, down = canopy_picture(chm)
     data = {name: record.get(name) for name in RECORD} | {
+        "origin": record["origin"] if "lat" in (record.get("origin") or ()) else None,
         "zero": zero,
         "outlines": [rings(polygon, zero, tolerance=TOLERANCE) for polygon in parcel.geometry],
         "totals": totals(rows, parcel),

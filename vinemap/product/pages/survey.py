@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pyogrio
 import shapely
+from pyogrio.errors import DataLayerError, DataSourceError
 from pyproj import CRS
 
 from vinemap import __version__, paths
@@ -43,7 +44,8 @@ class Product(NamedTuple):
     survey: str | None
     flown: datetime
     outline: shapely.Geometry
-    """In WGS 84, x east."""
+    """In WGS 84, x east, or in local coordinates."""
+    local: bool
     crs: str
     area: float
     """m²."""
@@ -103,8 +105,8 @@ def read_products(folder: Path) -> Iterator[Product]:
         try:
             item = json.loads(paths.stac_item(place, place.name).read_text(encoding="utf-8"))
             record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
-            outline = shapely.make_valid(shapely.from_geojson(json.dumps(item["geometry"])))
-            parcel = str(record["parcel"])
+            parcel, local = str(record["parcel"]), item["geometry"] is None
+            outline = _local_outline(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
             linked = {
                 "report": paths.report(place, parcel),
                 "layers": paths.geopackage(place, parcel),
@@ -115,7 +117,8 @@ def read_products(folder: Path) -> Iterator[Product]:
                 parcel,
                 record["survey"],
                 datetime.fromisoformat(record["flown"]),
-                outline,
+                shapely.make_valid(outline),
+                local,
                 str(record["crs"]),
                 float(item["properties"].get("vinemap:area_m2", np.nan)),
                 tuple(map(str, record["warnings"])),
@@ -123,21 +126,30 @@ def read_products(folder: Path) -> Iterator[Product]:
                 as_json([record["key"], record["files"]]),
             )
             west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
-            if product.flown.tzinfo and -180 <= west <= east <= 180 and -90 <= south <= north <= 90:
+            if product.flown.tzinfo and (local or (-180 <= west <= east <= 180 and -90 <= south <= north <= 90)):
                 yield product
         except (OSError, ValueError, KeyError, TypeError, AttributeError, shapely.errors.ShapelyError):
             continue
 
 
+def _local_outline(folder: Path, parcel: str) -> shapely.Geometry:
+    """A parcel's polygon where nothing tells of its place on the globe."""
+    try:
+        outline: shapely.Geometry = pyogrio.read_dataframe(paths.geopackage(folder, parcel), layer="parcel").union_all()
+    except (DataSourceError, DataLayerError) as error:
+        raise ValueError(str(error)) from error
+    return outline
+
+
 def find_earlier(products: Mapping[str, Product], folder: Path) -> dict[str, Product]:
     """For each parcel the latest product of an earlier flight that overlaps it, among the surveys beside a folder."""
-    left = dict(products)
+    left = {name: product for name, product in products.items() if not product.local}
     found: dict[str, Product] = {}
     if not left:
         return found
     latest = max(product.flown for product in left.values())
     for _, beside in sorted(_surveys_beside(folder.resolve(), latest), key=lambda known: known[0], reverse=True):
-        others = [product for product in read_products(beside) if product.flown < latest]
+        others = [product for product in read_products(beside) if product.flown < latest and not product.local]
         outlines = np.array([product.outline for product in others], dtype=object)
         tree = shapely.STRtree(outlines)
         for name, product in list(left.items()):
@@ -227,7 +239,10 @@ def survey_page(
         rows = dict(zip(products, tables, strict=True))
         pairs = [(rows[name], product) for name, product in earlier.items()]
         compared = dict(zip(earlier, in_threads(lambda pair: _compare(*pair), pairs), strict=True))
-    shapes = {name: project(product.outline, WGS84, crs) for name, product in products.items()}
+    shapes = {
+        name: product.outline if product.local else project(product.outline, WGS84, crs)
+        for name, product in products.items()
+    }
     bounds = shapely.total_bounds(list(shapes.values())) if shapes else np.zeros(4)
     zero = np.floor(bounds[:2])
     parcels = []

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shapely import affinity
 
-from vinemap.cloud.zones import deal, zones_of
+from vinemap.geo.zones import deal, zones_of
 
 PLACE = np.array([414_700.0, 4_940_700.0])
 SQUARE = shapely.box(*PLACE, *(PLACE + 10))

@@ -1,0 +1,117 @@
+"""Which files hold a cloud: one or many, tiles or flights, that are worked as one."""
+
+from __future__ import annotations
+
+import struct
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinemap.cloud.las_end import begins_as_las, read_head
+from vinemap.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+CLOUDS = (".las", ".laz")
+COPC = ".copc.laz"
+
+
+def listed(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
+    """One file or several, as several."""
+    return (clouds,) if isinstance(clouds, Path) else tuple(clouds)
+
+
+def cloud_files(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
+    """The files of a cloud, in order: those that are given, those in folders that are given, each of them once.
+
+    A file in two formats side by side (``a.laz`` and ``a.copc.laz``, as programs leave them) is one.
+
+    Raises
+    ------
+    InputError
+        If there is none, or a folder can't be read, or one file of a name has another number of points.
+    """
+    found: list[Path] = []
+    for path in listed(clouds):
+        if not path.is_dir():
+            found.append(path)
+            continue
+        try:
+            inside = [p for p in sorted(path.iterdir()) if is_cloud(p)]
+        except OSError as error:
+            raise InputError(f"{path}: can't be read ({error.strerror})") from error
+        if not inside:
+            raise InputError(f"{path}: holds no LAS, LAZ or COPC file")
+        found += inside
+    if not found:
+        raise InputError("there is no cloud: name a LAS, LAZ or COPC file")
+    return once(found)
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file is a cloud by its name, and not one that is hidden."""
+    return path.suffix.lower() in CLOUDS and not path.name.startswith(".") and path.is_file()
+
+
+def once(files: Sequence[Path]) -> tuple[Path, ...]:
+    """Files without those that stand beside one of the same name in a better format: COPC before LAZ before LAS.
+
+    Raises
+    ------
+    InputError
+        If they hold another number of points.
+    """
+    best: dict[tuple[Path, str], Path] = {}
+    for path in files:
+        key = path.parent, name_of(path)
+        other = best.setdefault(key, path)
+        if other == path:
+            continue
+        if points_in(path) != points_in(other):
+            raise InputError(f"{other} and {path.name} hold another number of points: keep the one that is right")
+        best[key] = max(path, other, key=_rank)
+    return tuple(best.values())
+
+
+def name_of(path: Path) -> str:
+    """Name of a cloud without what tells its format."""
+    return path.stem.removesuffix(".copc").removesuffix(".COPC")
+
+
+def points_in(path: Path) -> int | None:
+    """Number of points of which a file's header tells; None if it has no whole header."""
+    try:
+        with path.open("rb") as stream:
+            head = read_head(stream) if begins_as_las(stream) else None
+    except OSError:
+        return None
+    return head.n if head else None
+
+
+def date_of(path: Path) -> datetime | None:
+    """Midnight (UTC) of the day that a file's header states as its date; None if it states none.
+
+    Raises
+    ------
+    OSError
+        If the file can't be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(94)
+    if len(head) < 94:
+        return None
+    day, year = struct.unpack("<HH", head[90:])
+    return (
+        datetime(year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1) if 1 <= day <= 366 and 1970 < year < 9999 else None
+    )
+
+
+def _rank(path: Path) -> tuple[bool, bool]:
+    return path.name.lower().endswith(COPC), path.suffix.lower() == ".laz"
+
+
+def worded(files: Sequence[Path]) -> str:
+    """Files as an error names them."""
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"{files[0]}{more}"

@@ -1,0 +1,191 @@
+"""Whether coordinates can lie where their CRS says, and how well PROJ knows where that is."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import AreaOfInterest, TransformerGroup
+
+from vinemap.errors import InputError
+from vinemap.geo.crs import WGS84, code_of, horizontal, is_local, stated, transformer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pyproj._crs import AreaOfUse
+
+MARGIN = 1.0
+"""Degrees beyond its area of use in which a CRS still serves: next to its zone, in surveys of a whole country."""
+NEAR_ZERO = 0.02
+"""Share of the way from (0, 0) to the middle of an area within which coordinates are local ones."""
+AMIDST = 0.5
+"""Share of the way from the middle of an area to its corner within which a point is amidst it."""
+FOOT = 0.3048
+ROUGH = 3.0
+"""Metres of accuracy, as PROJ states it, up to which a transformation isn't worth a word."""
+SAME = 0.01
+"""Metres within which two places are the same."""
+GLOBE = 6_371_000.0
+"""Metres of its radius."""
+
+
+class Place(NamedTuple):
+    """Where the points of files are: their CRS, the vertical datum that is stated, and what is to be known of both."""
+
+    crs: CRS
+    vertical: str | None = None
+    remarks: Sequence[str] = ()
+    """A sentence each; whole when all points were read."""
+
+
+def check_place(crs: CRS, x: float, y: float, of: str) -> None:
+    """Make sure that a point lies where its CRS is used.
+
+    Parameters
+    ----------
+    crs : CRS
+        CRS of the coordinates.
+    x, y : float
+        The point, x east.
+    of : str
+        Whose coordinates they are.
+
+    Raises
+    ------
+    InputError
+        If it doesn't, with what the reason may be.
+    """
+    flat = horizontal(crs)
+    area = _area(flat)
+    if is_local(flat) or area is None:
+        return
+    if _is_near_zero(flat, area, x, y):
+        reason = "they seem to be local metres: give their CRS with --crs EPSG:n, or --crs local"
+    elif _holds(area, *_lon_lat(flat, x, y)):
+        return
+    else:
+        ways = {
+            "x and y seem to be swapped": (y, x),
+            "their signs seem to be turned": (-x, -y),
+            "x and y seem to be swapped and their signs turned": (-y, -x),
+            "the sign of x seems to be turned": (-x, y),
+            "the sign of y seems to be turned": (x, -y),
+            **_in_other_unit(flat, x, y),
+        }
+        right = (way for way, other in ways.items() if _holds(area, *_lon_lat(flat, *other), margin=0.0))
+        reason = next(right, "perhaps they are swapped, negated, local or in another unit")
+        reason += ": give their CRS with --crs"
+    where = f"{area.west:g} to {area.east:g}° E, {area.south:g} to {area.north:g}° N"
+    raise InputError(f"{of}: coordinates ({x:.2f}, {y:.2f}) lie outside the area of {_called(flat)}, {where}: {reason}")
+
+
+def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
+    """What is to be known of the way from a CRS to WGS 84 near a point (x east): a sentence each."""
+    flat = horizontal(crs)
+    if is_local(flat):
+        return []
+    return [*_roughness(flat, x, y), *_other_shift(stated(crs), flat, x, y)]
+
+
+def _roughness(flat: CRS, x: float, y: float) -> list[str]:
+    """Whether PROJ knows a place in WGS 84 less well than it could, or than matters."""
+    lon, lat = _lon_lat(flat, x, y)
+    if flat.is_bound or not (np.isfinite(lon) and np.isfinite(lat)):
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of grids that are missing
+        near = AreaOfInterest(lon, lat, lon, lat)
+        group = TransformerGroup(flat, WGS84, always_xy=True, area_of_interest=near)
+    metres = _accuracy(flat, x, y)
+    known = "positions in WGS 84 are " + (f"good to {metres:g} m only" if metres >= 0 else "of unknown accuracy")
+    if not group.best_available and group.unavailable_operations:
+        best = group.unavailable_operations[0]
+        names = ", ".join(grid.short_name for grid in best.grids if not grid.available)
+        better = f", which would make it {best.accuracy:g} m" if 0 <= best.accuracy < metres else ""
+        return [f"{known}: PROJ lacks the grid {names} for {_called(flat)}{better}"]
+    if metres > ROUGH or metres < 0:
+        return [f"{known}: PROJ knows no better way there from {_called(flat)}"]
+    return []
+
+
+def _accuracy(flat: CRS, x: float, y: float) -> float:
+    """Metres that PROJ states for the way it takes from a point to WGS 84; negative where it knows none."""
+    convert = transformer(flat, WGS84)
+    convert.transform(x, y)
+    try:
+        return float(convert.get_last_used_operation().accuracy)
+    except ProjError:
+        return float(convert.accuracy)
+
+
+def _other_shift(bound: CRS, flat: CRS, x: float, y: float) -> list[str]:
+    """Whether a shift that is stated beside a CRS, and doesn't count, leads elsewhere."""
+    if bound == flat:
+        return []
+    (lon, other), (lat, beside) = zip(
+        transformer(flat, WGS84).transform(x, y), transformer(bound, WGS84).transform(x, y), strict=True
+    )
+    way = np.radians([(other - lon) * np.cos(np.radians(lat)), beside - lat])
+    metres = float(GLOBE * np.hypot(*way))
+    if not metres > SAME:
+        return []
+    return [f"the TOWGS84 beside {_called(flat)} leads {metres:.2f} m elsewhere; what PROJ knows of that CRS counts"]
+
+
+def _in_other_unit(flat: CRS, x: float, y: float) -> dict[str, tuple[float, float]]:
+    """A point as it would be if its numbers were metres for feet, or feet for metres."""
+    unit = flat.axis_info[0].unit_conversion_factor
+    if not flat.is_projected:
+        return {}
+    if unit == 1:
+        return {"they seem to be in feet": (FOOT * x, FOOT * y)}
+    return {"they seem to be in metres": (x / unit, y / unit)}
+
+
+def _called(flat: CRS) -> str:
+    code = code_of(flat)
+    return f"{':'.join(code)} ({flat.name})" if code else flat.name
+
+
+def _area(flat: CRS) -> AreaOfUse | None:
+    """Where a CRS is used, stated by itself or known by its code."""
+    code = code_of(flat)
+    try:
+        return flat.area_of_use or (CRS.from_authority(*code).area_of_use if code else None)
+    except CRSError:
+        return None
+
+
+def _lon_lat(flat: CRS, x: float, y: float) -> tuple[float, float]:
+    """Degrees east and north; infinite where there are none."""
+    try:
+        lon, lat = transformer(flat, WGS84).transform(x, y)
+    except ProjError:
+        return np.inf, np.inf
+    return float(lon), float(lat)
+
+
+def _holds(area: AreaOfUse, lon: float, lat: float, *, margin: float = MARGIN) -> bool:
+    """Whether an area, which may reach over the antimeridian, holds a place, with a margin in degrees."""
+    if not (abs(lon) <= 360 and area.south - margin <= lat <= area.north + margin):
+        return False
+    width = (area.east - area.west) % 360 or 360.0
+    return bool((lon - area.west + margin) % 360 <= width + 2 * margin)
+
+
+def _is_near_zero(flat: CRS, area: AreaOfUse, x: float, y: float) -> bool:
+    """Whether a point lies as near to the zero of a projected CRS as to be one of local coordinates.
+
+    Where zero is amidst the area, nothing can be told.
+    """
+    if not flat.is_projected:
+        return False
+    lon, lat = area.west + (area.east - area.west) % 360 / 2, (area.south + area.north) / 2
+    ways = transformer(WGS84, flat).transform([lon, area.west], [lat, area.south])
+    (middle, corner) = np.transpose(ways)
+    far = np.hypot(*middle)
+    return bool(np.hypot(x, y) < NEAR_ZERO * far and far > AMIDST * np.hypot(*(middle - corner)))

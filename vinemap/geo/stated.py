@@ -1,0 +1,202 @@
+"""What a LAS file states of its coordinates: their CRS, in WKT or in GeoTIFF keys, and how finely they are stored."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pyproj import CRS
+from pyproj.crs import CompoundCRS
+from pyproj.database import get_units_map
+from pyproj.exceptions import CRSError
+
+from vinemap.errors import InputError
+from vinemap.geo.crs import (
+    ELLIPSOIDAL,
+    UNKNOWN,
+    check_horizontal,
+    horizontal,
+    is_local,
+    stated,
+    vertical,
+    vertical_name,
+    vertical_unit,
+)
+from vinemap.geo.place import check_place, doubts_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vinemap.compute.arrays import Floats
+    from vinemap.geo.place import Place
+
+VERTICAL, CITATION, VERTICAL_UNIT = 4096, 4097, 4099
+"""GeoTIFF's keys of a vertical CRS, of what it is called, and of the unit of heights."""
+ELLIPSOIDS, DATUMS = range(5001, 5100), range(5101, 5200)
+"""Codes that GeoTIFF 1.0 has for heights above an ellipsoid, and above a datum whose CRS has a code 600 higher."""
+HEIGHTS = 'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["up",up],LENGTHUNIT["unit",{!r}]]'
+SPAN_OF_DEGREES = 1.0
+"""Degrees that no survey spans."""
+FINE = 0.05
+"""Metres of a step in coordinates that does no harm, however close the points."""
+SAMPLE = 50_000
+FEW = 0.25
+"""Share of a sample that has values of its own, below which the steps between them are those of their storage."""
+LEAST = 0.1
+"""Order of the differences between values that is their step; others are some steps."""
+DEGREE = 111_195.0
+"""Metres of a degree of latitude."""
+
+
+def crs_of(header: Any, given: CRS | None, path: Path) -> CRS:
+    """The CRS of a file's coordinates: what is given, or what its header states.
+
+    Heights are what the header states of them, where what is given tells nothing of heights.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it can't be used.
+    """
+    try:
+        plain: CRS | None = given or header.parse_crs()
+        up = _vertical(header)
+    except Exception as error:
+        if given:
+            return check_horizontal(given)
+        reason = str(error).rpartition("(Internal Proj Error: ")[2][:120].strip(" )")
+        raise InputError(f"{path}: its CRS can't be understood ({reason}): give it with --crs EPSG:n") from error
+    if plain is None:
+        raise InputError(f"{path}: states no CRS for its coordinates: give it with {_hint(header)}")
+    if up is None or plain.is_compound or len(plain.axis_info) > 2 or is_local(plain):
+        return check_horizontal(plain)
+    return CompoundCRS(f"{plain.name} + {up.name}", [stated(check_horizontal(plain)), up])
+
+
+def _hint(header: Any) -> str:
+    low, high = header.mins[:2], header.maxs[:2]
+    degrees = (np.abs([low, high]) <= [180, 90]).all() and (high - low).max() < SPAN_OF_DEGREES
+    return f"--crs {'EPSG:4326, as they look like degrees' if degrees else 'EPSG:n, or local if they are local metres'}"
+
+
+def _vertical(header: Any) -> CRS | None:
+    """The vertical CRS that a header states, in WKT or in GeoTIFF keys."""
+    records = [*header.vlrs.get_by_id("LASF_Projection"), *(header.evlrs or ())]
+    for text in filter(None, (getattr(record, "string", "") for record in records)):
+        try:
+            if up := vertical(CRS.from_wkt(text)):
+                return up
+        except CRSError:
+            continue  # of a file whose CRS is given
+    keys = {key.id: key for record in records for key in getattr(record, "geo_keys", ())}
+    code, unit = (keys[key].value_offset if key in keys else 0 for key in (VERTICAL, VERTICAL_UNIT))
+    metres = _units().get(unit)
+    if code in ELLIPSOIDS:
+        return CRS.from_wkt(HEIGHTS.format(ELLIPSOIDAL, ELLIPSOIDAL, metres or 1.0))
+    known = _vertical_of(code + 600 if code in DATUMS else code)
+    if known and metres in (None, known.axis_info[0].unit_conversion_factor):
+        return known
+    name = known.name if known else _citation(records, keys)
+    return CRS.from_wkt(HEIGHTS.format(name, name, metres or 1.0)) if metres or name != UNKNOWN else None
+
+
+def _vertical_of(code: int) -> CRS | None:
+    try:
+        crs = CRS.from_epsg(code)
+    except CRSError:
+        return None
+    return crs if crs.is_vertical and not crs.is_compound else None
+
+
+def _citation(records: list[Any], keys: dict[int, Any]) -> str:
+    """What GeoTIFF keys call heights in words."""
+    words = b"".join(record.record_data_bytes() for record in records if getattr(record, "strings", None))
+    if (key := keys.get(CITATION)) is None:
+        return UNKNOWN
+    text = words[key.value_offset : key.value_offset + key.count].decode("ascii", "ignore")
+    return text.strip("|\0 ").replace('"', "") or UNKNOWN
+
+
+@lru_cache(maxsize=1)
+def _units() -> dict[int, float]:
+    """Metres of units of length by their EPSG codes."""
+    return {int(unit.code): unit.conv_factor for unit in get_units_map("EPSG", category="linear").values()}
+
+
+def check_heights(source: CRS, place: Place, path: Path, first: Path) -> None:
+    """Make sure that a file's heights are above the same datum as those of the first.
+
+    Raises
+    ------
+    InputError
+        If they aren't, as far as both files tell.
+    """
+    if (vertical := vertical_name(source)) != place.vertical:
+        raise InputError(
+            f"{path}: its heights are above {vertical or 'no datum that it states'}, those of {first.name} above "
+            f"{place.vertical or 'none'}: say with --crs EPSG:n+m what all are"
+        )
+
+
+def examined(xyz: Floats, header: Any, source: CRS, path: Path) -> list[str]:
+    """What is to be known of where a file's points are, some of which (n, 3) are given in its own CRS.
+
+    Raises
+    ------
+    InputError
+        If they can't be there, or are stored too coarsely.
+    """
+    x, y = np.median(xyz[:, :2], axis=0).tolist()
+    check_place(source, x, y, str(path))
+    check_steps(xyz, header, source, path)
+    return doubts_of(source, x, y)
+
+
+def check_steps(xyz: Floats, header: Any, crs: CRS, path: Path) -> None:
+    """Make sure that points (n, 3) of a file aren't stored more coarsely than they lie apart.
+
+    The steps are those that the file's scale states, or greater ones that the coordinates show: they may have been
+    rounded before, or kept in single precision.
+
+    Parameters
+    ----------
+    xyz : ndarray (n, 3)
+        Some of the file's points, in their order.
+    header : laspy.LasHeader
+        Of the file.
+    crs : CRS
+        CRS of the coordinates.
+    path : Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If they are.
+    """
+    flat = horizontal(crs)
+    unit = flat.axis_info[0].unit_conversion_factor
+    metres = (
+        np.array([np.cos(np.radians(np.median(xyz[:, 1]))), 1.0]) * DEGREE if flat.is_geographic else np.full(2, unit)
+    )
+    whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(xyz[:, :2], axis=0)
+    areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, len(xyz)))]
+    apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
+    sample = xyz[:: max(1, len(xyz) // SAMPLE)]
+    sizes = [*metres, vertical_unit(crs)]
+    for axis, column, scale, size in zip("xyz", sample.T, header.scales, sizes, strict=True):
+        step = max(float(scale), _step(column))
+        if step * size > max(FINE, apart):
+            lie = f"lie {apart:.2f} m apart" if apart else "all lie in one place"
+            known = f"{step:g} (scale {scale:g}), {float(f'{step * size:.2g}'):g} m"
+            raise InputError(
+                f"{path}: its {axis} is stored in steps of {known}, but its points {lie}: "
+                "export the cloud anew, with a finer scale"
+            )
+
+
+def _step(values: Floats) -> float:
+    """Steps between values (n,) that many share; 0 where few do."""
+    known = np.unique(values)
+    return float(np.quantile(np.diff(known), LEAST)) if 2 < len(known) < FEW * len(values) else 0.0
