@@ -52,7 +52,7 @@ def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
     )
     products = paths.survey_products(survey)
     with progress(parcel) as show:
-        return follow(recipe, products / parcel, within=products, step=as_tasks(show))
+        return follow(recipe, paths.parcel_folder(products, parcel), within=products, step=as_tasks(show))
 
 
 def ensure_cloud(config: SurveyConfig) -> None:

@@ -8,7 +8,7 @@ import sys
 import time
 from types import SimpleNamespace
 
-from vinemap import errors
+from vinemap import errors, paths
 from vinemap.product import store
 
 
@@ -16,7 +16,7 @@ def follow(recipe, folder, *, piece=None, drafts=None, within=None):
     """Leave a product of two files, unless the parcel's name tells of something else."""
     began = time.perf_counter()
     with store.product(folder, drafts=drafts, within=within) as draft:
-        (draft / f"{recipe.parcel}.gpkg").write_text(recipe.parcel)
+        paths.geopackage(draft, recipe.parcel).write_text(recipe.parcel)
         deed = DEEDS.get(recipe.parcel.split()[0])
         if deed:
             deed()

@@ -22,7 +22,7 @@ from vinemap.cloud.pieces import read_piece
 from vinemap.cloud.tiles import Collector
 from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
-from vinemap.config.names import check_name
+from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.geo.crs import check_near, corner_of
@@ -206,7 +206,7 @@ def map_parcel(
     VinemapError
         If the input can't be used or the product can't be written.
     """
-    name = check_name(parcel)
+    name = check_parcel(parcel)
     if settings:
         check_engine(settings.ground.engine)
     recipe = recipe_of(cloud, parcel=name, named=named, boundary=boundary, settings=settings, crs=crs, origin=origin)

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
 
 DATA = Path("data")
 LONGEST_NAME = 64
 MOST_BYTES = 160
 """Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
+FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%(?=[0-9a-fA-F]{2})')
+"""What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
+DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+"""Names that Windows keeps for itself."""
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
@@ -28,6 +33,13 @@ TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
 WEB = Path(__file__).parent / "product" / "pages" / "web"
 PAGE_STYLE, PAGE_LICENCES = WEB / "dist" / "style.css", WEB / "dist" / "LICENSES.txt"
 """Style of pages, and the licences of what they bundle."""
+
+
+def safe(name: str) -> str:
+    """A name as a file can have it on any system: the name itself, if it can."""
+    cut = FORBIDDEN.sub("-", name).lstrip(".- ")[:LONGEST_NAME].encode()[:MOST_BYTES]
+    plain = cut.decode(errors="ignore").rstrip(". ")
+    return f"_{plain}" if not plain or DEVICES.fullmatch(plain) else plain
 
 
 def stem(cloud: Path) -> str:
@@ -83,17 +95,27 @@ def prefect_home() -> Path:
 
 def product_folder(survey: str, parcel: str) -> Path:
     """Folder of a parcel's product."""
-    return survey_products(survey) / parcel
+    return parcel_folder(survey_products(survey), parcel)
+
+
+def alike(folder: Path) -> Path:
+    """A folder as systems tell it from others, some of which take small letters and capitals for the same."""
+    return folder.with_name(folder.name.casefold()) if sys.platform in ("win32", "darwin") else folder
+
+
+def parcel_folder(products: Path, parcel: str) -> Path:
+    """Folder of a parcel's product among those of a survey."""
+    return products / safe(parcel)
 
 
 def geopackage(folder: Path, parcel: str) -> Path:
     """GeoPackage of a product."""
-    return folder / f"{parcel}.gpkg"
+    return folder / f"{safe(parcel)}.gpkg"
 
 
 def raster(folder: Path, parcel: str, kind: str) -> Path:
     """One of the rasters of a product."""
-    return folder / f"{parcel}_{kind}.tif"
+    return folder / f"{safe(parcel)}_{kind}.tif"
 
 
 def raster_style(path: Path) -> Path:
@@ -103,22 +125,22 @@ def raster_style(path: Path) -> Path:
 
 def project(folder: Path, parcel: str) -> Path:
     """QGIS project of a product."""
-    return folder / f"{parcel}.qgz"
+    return folder / f"{safe(parcel)}.qgz"
 
 
 def canopy_mesh(folder: Path, parcel: str) -> Path:
     """Mesh of the canopies, as glTF."""
-    return folder / f"{parcel}_canopy.glb"
+    return folder / f"{safe(parcel)}_canopy.glb"
 
 
 def exported_mesh(folder: Path, parcel: str, kind: str) -> Path:
     """Mesh of the canopies in another format ("ply", "obj")."""
-    return folder / f"{parcel}_canopy.{kind}"
+    return folder / f"{safe(parcel)}_canopy.{kind}"
 
 
 def exported_frame(folder: Path, parcel: str) -> Path:
     """Frame of such a mesh."""
-    return folder / f"{parcel}_canopy_frame.json"
+    return folder / f"{safe(parcel)}_canopy_frame.json"
 
 
 def tileset(folder: Path) -> Path:
@@ -128,7 +150,7 @@ def tileset(folder: Path) -> Path:
 
 def classified_cloud(folder: Path, parcel: str) -> Path:
     """Cloud of a parcel with a class and a row for every point."""
-    return folder / f"{parcel}_classified.laz"
+    return folder / f"{safe(parcel)}_classified.laz"
 
 
 def drive_frames(folder: Path) -> Path:
@@ -158,12 +180,14 @@ def exports() -> Path:
 
 def export_folder(folder: Path, parcel: str, kind: str) -> Path:
     """Folder of a parcel in one of the formats of exports."""
-    return folder / parcel / kind
+    return parcel_folder(folder, parcel) / kind
 
 
 def exported(folder: Path, name: str, layer: str, suffix: str) -> Path:
-    """File of an export."""
-    return folder / f"{name}_{layer}{suffix}"
+    """File of an export, of a parcel or a block of one."""
+    parcel, _, block = name.rpartition("_")
+    named = f"{safe(parcel)}_{block}" if block.isdigit() else safe(name)
+    return folder / f"{named}_{layer}{suffix}"
 
 
 def task_data(folder: Path) -> Path:
@@ -173,7 +197,7 @@ def task_data(folder: Path) -> Path:
 
 def agopengps_field(folder: Path, parcel: str) -> Path:
     """Folder of a field of AgOpenGPS, by whose name it is chosen there."""
-    return folder / parcel
+    return parcel_folder(folder, parcel)
 
 
 def agopengps_file(folder: Path, kind: str) -> Path:
@@ -233,7 +257,7 @@ def survey_record(folder: Path) -> Path:
 
 def stac_item(folder: Path, name: str) -> Path:
     """STAC item of a parcel in its product's folder, or of a survey in that of its products."""
-    return folder / f"{name}_stac.json"
+    return folder / f"{safe(name)}_stac.json"
 
 
 def stac_collection(folder: Path) -> Path:
@@ -243,7 +267,7 @@ def stac_collection(folder: Path) -> Path:
 
 def report(folder: Path, parcel: str) -> Path:
     """Page of a parcel, in its product's folder."""
-    return folder / f"{parcel}_report.html"
+    return folder / f"{safe(parcel)}_report.html"
 
 
 def index(folder: Path) -> Path:

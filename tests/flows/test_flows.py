@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import geopandas as gpd
 import pytest
 
 from vinemap.parcel import STAGES
@@ -111,8 +112,10 @@ def show():
 
 def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
     """Of two parcels in the same polygon, one with an origin that lies elsewhere."""
+    one = gpd.read_file(place / "data" / "surveys" / "small" / "parcels.gpkg")
+    gpd.GeoDataFrame({"name": ["B", "C"]}, geometry=[*one.geometry] * 2, crs=one.crs).to_file(place / "two.gpkg")
     (place / "two.yaml").write_text(
-        "survey: twice\ncloud: data/surveys/small/small.laz\nboundaries: data/surveys/small/parcels.gpkg\n"
+        "survey: twice\ncloud: data/surveys/small/small.laz\nboundaries: two.gpkg\n"
         "parcels: [B, C]\noverrides: {C: {origin: [0, 0, 0]}}\n"
     )
     done = flow(place, code=SEEN + "sys.argv[1:] = ['two.yaml']\ntry:\n    flows.survey.main()\nfinally:\n    show()")

@@ -1,11 +1,14 @@
 """Polygons of parcels, as people's files have them."""
 
+import zipfile
+
 import geopandas as gpd
 import pytest
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.boundaries import read_boundary, read_parcels
+from vinemap.geo.boundaries import NoAreaError, read_boundary, read_parcel, read_parcels
+from vinemap.geo.crs import LOCAL
 
 
 @pytest.mark.parametrize("suffix", ["gpkg", "geojson", "shp"])
@@ -44,8 +47,11 @@ def polygons(path, **columns):
         ({"no": [3, 1, 2], "Name": ["A", "B", "C"]}, ["A", "B", "C"]),
         ({"area": [0.5, 1.5, 2.5], "LABEL": ["b", "c", "a"], "vine": ["x", "y", "z"]}, ["b", "c", "a"]),
         ({"name": ["A", "B", "A"], "id": [7, 8, 9]}, ["7", "8", "9"]),
-        ({"name": ["A", None, "C"], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
-        ({"name": ["A", " ", "C"], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
+        ({"id": [1, 2, 3], "name": ["A", "B", "C"]}, ["A", "B", "C"]),
+        ({"code": [1, 2, 3], "Label": ["A", "B", "C"]}, ["A", "B", "C"]),
+        ({"name": ["A", None, None], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
+        ({"name": ["123/4", "123/5", " 123/6  b"]}, ["123/4", "123/5", "123/6 b"]),
+        ({"id": [7.0, 8.0, 9.0]}, ["7", "8", "9"]),
     ],
 )
 def test_names_of_parcels(tmp_path, columns, names):
@@ -73,8 +79,120 @@ def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):
         assert read_boundary(path, parcel=name)[0].equals(square)
     assert read_boundary(path, parcel="1")[0].equals(squares[1])
     path, squares = polygons(tmp_path / "c.gpkg", name=["A", None, "1"], id=[1, 2, 3])
-    for name, square in zip(read_parcels(path), squares, strict=True):
-        assert read_boundary(path, parcel=name)[0].equals(square)
+    assert read_boundary(path, parcel="1")[0].equals(squares[2])
+    assert read_boundary(path, parcel="2")[0].equals(squares[1])
+
+
+@pytest.mark.parametrize("columns", [{}, {"id": [1, 2, 3]}, {"variety": ["Nebbiolo", "Barbera", "Dolcetto"]}])
+@pytest.mark.parametrize("nothing", [None, " "])
+def test_a_polygon_without_a_name_costs_itself_alone(tmp_path, columns, nothing):
+    path, squares = polygons(tmp_path / "b.gpkg", **columns, name=["A", "B", nothing])
+    found = read_parcels(path)
+    assert [found[name].boundary[0].equals(square) for name, square in zip("AB", squares, strict=False)] == [True, True]
+    with pytest.raises(InputError, match=r"b\.gpkg: polygon 3 has no name in column 'name': give it one"):
+        raise found["polygon 3"]
+    assert len(found) == 3
+
+
+@pytest.mark.parametrize(
+    ("columns", "asked", "right"),
+    [
+        ({"name": ["A"]}, "A", True),
+        ({"name": ["A"]}, "North", False),
+        ({"Name": ["North 3"], "id": [1]}, "North", False),
+        ({"id": [1]}, "North", True),
+        ({"id": [7]}, "8", False),
+        ({"id": [7]}, "7", True),
+        ({"code": ["N3"]}, "North", False),
+        ({"hectares": [1.5]}, "North", True),
+        ({"name": [None]}, "North", True),
+    ],
+)
+def test_a_single_polygon_is_the_parcels_unless_it_has_another_name(tmp_path, columns, asked, right):
+    path, (square,) = polygons(tmp_path / "b.gpkg", **columns)
+    if right:
+        assert read_boundary(path, parcel=asked)[0].equals(square)
+        return
+    with pytest.raises(InputError, match=f"none of its 1 polygons has '{asked}' in a column"):
+        read_boundary(path, parcel=asked)
+
+
+def collections(path):
+    """Of three features with names one is a polygon, one a polygon with its label's point, and one a line."""
+    a, b, c = (shapely.box(k, 0, k + 0.9, 1) for k in range(3))
+    inner = shapely.GeometryCollection([shapely.MultiPolygon([b]), b.centroid])
+    shapes = [a, shapely.GeometryCollection([inner, shapely.LineString([(1, 0), (2, 0)])]), c.exterior]
+    gpd.GeoDataFrame({"name": ["A", "B", "C"]}, geometry=shapes, crs=4326).to_file(path)
+    return a, b, c
+
+
+@pytest.mark.parametrize("suffix", ["geojson", "gpkg"])
+def test_collections_keep_their_polygons_and_the_rest_is_named(tmp_path, suffix):
+    path = tmp_path / f"b.{suffix}"
+    a, b, _ = collections(path)
+    found = read_parcels(path)
+    assert found["A"].boundary[0].equals(a)
+    assert found["A"].remarks == ()
+    assert found["B"].boundary[0].equals(b)
+    beside = "of the boundary only polygons count, not what stands beside them (1 LineString, 1 Point)"
+    assert found["B"].remarks == (beside,)
+    assert isinstance(found["C"], NoAreaError)
+    assert str(found["C"]) == "a LineString 'C' is no polygon"
+    whole = read_parcel(path)
+    assert whole.boundary[0].equals(shapely.union_all([a, b]))
+    assert whole.remarks[1] == f"b.{suffix} holds what is no polygon, and is left out: a LineString 'C'"
+    with pytest.raises(NoAreaError):
+        read_boundary(path, parcel="C")
+
+
+KML = """<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document>
+<Folder><name>Home</name><Placemark><name>A</name><description>one</description><MultiGeometry>{}<Point><coordinates>
+0.5,0.5</coordinates></Point></MultiGeometry></Placemark></Folder>
+<Folder><name>Hill</name><Placemark><name>B</name><description>two</description>{}</Placemark>
+<Placemark><name>Gate</name><Point><coordinates>1,1</coordinates></Point></Placemark></Folder></Document></kml>"""
+RING = "<Polygon><outerBoundaryIs><LinearRing><coordinates>{}</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_kml_with_folders(tmp_path, packed):
+    squares = [shapely.box(k, 0, k + 0.9, 1) for k in range(2)]
+    rings = [RING.format(" ".join(f"{x},{y},0" for x, y in s.exterior.coords)) for s in squares]
+    path = tmp_path / ("b.kmz" if packed else "b.kml")
+    if packed:
+        with zipfile.ZipFile(path, "w") as target:
+            target.writestr("doc.kml", KML.format(*rings))
+    else:
+        path.write_text(KML.format(*rings))
+    found = read_parcels(path)
+    for name, square in zip("AB", squares, strict=True):
+        assert found[name].boundary[0].equals(square)
+    assert str(found["Gate"]) == "a Point 'Gate' is no polygon"
+    assert len(found) == 3
+
+
+@pytest.mark.parametrize("folder", ["", "Parcels 2026/"])
+def test_a_zipped_shapefile(tmp_path, folder):
+    _, squares = polygons(tmp_path / "b.shp", name=["A", "B"])
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as packed:
+        for part in tmp_path.glob("b.*"):
+            if part.suffix != ".zip":
+                packed.write(part, f"{folder}{part.name}")
+        packed.writestr("__MACOSX/._b.shp", "")
+    assert read_boundary(tmp_path / "b.zip", parcel="B")[0].equals(squares[1])
+    with zipfile.ZipFile(tmp_path / "c.zip", "w") as packed:
+        packed.writestr("flight.laz", "")
+    with pytest.raises(InputError, match=r"c\.zip: holds 0 files of polygons .*: unpack it"):
+        read_boundary(tmp_path / "c.zip")
+
+
+def test_local_polygons_need_no_crs(tmp_path):
+    square = shapely.box(0, 0, 1, 1)
+    path = tmp_path / "b.gpkg"
+    with pytest.warns(UserWarning, match="'crs' was not provided"):
+        gpd.GeoDataFrame({"name": ["A"]}, geometry=[square]).to_file(path)
+    assert read_parcel(path, parcel="A", local=True).boundary == (square, LOCAL)
+    with pytest.raises(InputError, match="no CRS"):
+        read_parcel(path, parcel="A")
 
 
 def test_polygons_of_one_name_are_one_parcel(tmp_path):

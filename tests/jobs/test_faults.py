@@ -383,16 +383,20 @@ def test_a_job_for_some_parcels_forgets_no_other(job):
     assert [one["parcel"] for one in job.record()["parcels"]] == ["A", "C"]
 
 
-def test_names_that_cannot_be(job):
-    odd = {"a/b": 1, "..": 2, "CON": 3, "x" * 65: 4, ".hidden": 5, "tab\there": 6}
-    job.draw(**{"A": 0, "é" * 64: 7, "🍇" * 40: 8} | odd)
+def test_names_that_cannot_name_folders(job):
+    odd = {"a/b": "a-b", "CON": "_CON", "x" * 65: "x" * 64, ".hidden": "hidden", "tab here": "tab here"}
+    drawn = ["A", "é" * 64, "🍇" * 40, "..", *odd, "a:b"]
+    job.draw(**{name: k for k, name in enumerate(drawn)})
     outcomes = job.run()
-    assert {parcel for parcel, one in outcomes.items() if one.state == DONE} == {"A", "é" * 64, "🍇" * 40}
-    for name in odd:
+    bad = {"..": "can't name a file, nor a parcel", "a:b": "its folder would be that of 'a"}
+    assert {parcel for parcel, one in outcomes.items() if one.state == DONE} == set(drawn) - set(bad)
+    for name, folder in odd.items():
+        assert recipe.product_in(job.folder / folder).parcel == name
+    for name, reason in bad.items():
         assert outcomes[name].state == FAILED
-        assert "can't name a file" in outcomes[name].reason
+        assert reason in outcomes[name].reason
         assert outcomes[name].line().count("\n") == 0
-    assert set(odd) <= {one["parcel"] for one in job.record()["parcels"]}
+    assert {*odd, *bad} <= {one["parcel"] for one in job.record()["parcels"]}
     assert job.states() == {parcel: CURRENT if one.state == DONE else FAILED for parcel, one in outcomes.items()}
     assert job.worked == []
 
@@ -579,7 +583,7 @@ def test_polygons_that_cannot_be_brought_to_the_cloud(job, tmp_path):
     for k, parcel in enumerate("ABC"):
         inside = shapely.contains_xy(square(k), *points[:, :2].T).sum()
         assert int((job.folder / parcel / "points.txt").read_text()) == pytest.approx(inside, abs=1)
-    boundaries = list(read_parcels(job.boundaries, ["x", "x"]).values()) * 2
+    boundaries = [read_parcels(job.boundaries)["x"].boundary] * 2
     assert [type(piece) for piece in split_cloud(job.cloud, boundaries, tmp_path)] == [InputError, InputError]
 
 
@@ -592,7 +596,7 @@ def test_polygons_without_a_place_on_earth(job):
     assert {one.state for one in outcomes.values()} == {FAILED}
     assert all("Undefined Cartesian SRS can't be brought to" in one.reason for one in outcomes.values())
     with pytest.raises(InputError, match="check their CRS"):
-        read_cloud(job.cloud, boundary=read_parcels(job.boundaries)["A"])
+        read_cloud(job.cloud, boundary=read_parcels(job.boundaries)["A"].boundary)
 
 
 def test_a_single_polygon_and_none(job):

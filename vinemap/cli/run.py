@@ -36,12 +36,12 @@ def run(
 ) -> None:
     """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
     from vinemap import paths
-    from vinemap.config.names import check_name
+    from vinemap.config.names import check_parcel
     from vinemap.config.settings import Settings
     from vinemap.config.surveys import load_settings
     from vinemap.geo.crs import parse_crs
 
-    name = check_name(parcel) if parcel is not None else paths.stem(cloud)
+    name = check_parcel(parcel) if parcel is not None else paths.stem(cloud)
     folder = out or paths.product_folder(paths.stem(cloud), name)
     chosen = load_settings(settings) if settings else Settings()
     extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}

@@ -1,8 +1,7 @@
-"""Names of parcels and surveys, which name files too."""
+"""Names of parcels and surveys: those of surveys name folders, those of parcels may be any."""
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from typing import Annotated
 
@@ -10,16 +9,11 @@ from pydantic import AfterValidator
 
 from vinemap.config.yaml_files import checked_by
 from vinemap.errors import ConfigError
-from vinemap.paths import LONGEST_NAME, MOST_BYTES
-
-FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%[0-9a-fA-F]{2}')
-"""What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
-DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
-"""Names that Windows keeps for itself."""
+from vinemap.paths import safe
 
 
 def check_name(name: str) -> str:
-    """Return the name of a parcel or survey, its Unicode composed, if it can be the name of a file.
+    """Return the name of a survey, its Unicode composed, if it can be the name of a file.
 
     Raises
     ------
@@ -27,16 +21,30 @@ def check_name(name: str) -> str:
         If it is empty, too long, or has characters of paths.
     """
     name = unicodedata.normalize("NFC", name)
-    if (
-        not 0 < len(name) <= LONGEST_NAME
-        or FORBIDDEN.search(name)
-        or DEVICES.fullmatch(name)
-        or name[0] in ".- "
-        or name[-1] in ". "
-        or len(name.encode()) > MOST_BYTES
-    ):
+    if safe(name) != name:
         raise ConfigError(f"name {name!r} can't name a file: use letters, digits, spaces, '-' and '_', a letter first")
     return name
 
 
-Name = Annotated[str, AfterValidator(lambda name: unicodedata.normalize("NFC", name)), checked_by(check_name)]
+def check_parcel(name: str) -> str:
+    """Return the name of a parcel, its Unicode composed and its spaces single.
+
+    Its files are named by what :func:`vinemap.paths.safe` makes of it ("123/4" lies in the folder "123-4").
+
+    Raises
+    ------
+    ConfigError
+        If it is empty, a way to another folder, or no text.
+    """
+    plain = " ".join(unicodedata.normalize("NFC", name).split())
+    if not plain.strip(". ") or {".", ".."} & set(plain.replace("\\", "/").split("/")) or not plain.isprintable():
+        raise ConfigError(f"name {name!r} can't name a file, nor a parcel: use letters and digits")
+    return plain
+
+
+def _composed(name: str) -> str:
+    return unicodedata.normalize("NFC", name)
+
+
+Name = Annotated[str, AfterValidator(_composed), checked_by(check_name)]
+ParcelName = Annotated[str, checked_by(check_parcel), AfterValidator(check_parcel)]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from vinemap.config.names import Name, check_name
+from vinemap.config.names import Name, ParcelName, check_parcel
 from vinemap.config.settings import Options, Settings
 from vinemap.config.yaml_files import checked_by, merge, nearest, read_yaml, validated
 from vinemap.errors import ConfigError
@@ -48,14 +48,16 @@ class _Surveys(Options):
     """What is the same for a survey and an estate."""
 
     boundaries: Path | None = Field(None, description="polygons of the parcels, named in one of their columns")
-    parcels: list[Name] | None = Field(None, min_length=1, description="names of the parcels; none: all that there are")
+    parcels: list[ParcelName] | None = Field(
+        None, min_length=1, description="names of the parcels; none: all that there are"
+    )
     crs: Annotated[str, checked_by(parse_crs)] | None = Field(
         None, description="CRS of the cloud, as EPSG:n, where the file states none or a wrong one"
     )
     origin: MainOrigin | None = Field(None, description="origin of {Main}: latitude, longitude (degrees), altitude (m)")
     settings: Settings = Settings()
     job: JobOptions = JobOptions()
-    overrides: dict[Name, ParcelConfig] = Field({}, description="what is otherwise in a parcel, by its name")
+    overrides: dict[ParcelName, ParcelConfig] = Field({}, description="what is otherwise in a parcel, by its name")
 
     @model_validator(mode="before")
     @classmethod
@@ -135,7 +137,7 @@ def choose_parcel(config: SurveyConfig, name: str) -> str:
     ConfigError
         If it doesn't; names the nearest that it does.
     """
-    name = check_name(name)
+    name = check_parcel(name)
     if config.parcels is None or name in config.parcels:
         return name
     raise ConfigError(f"survey {config.survey} has no parcel {name!r}: {nearest(name, config.parcels)}")

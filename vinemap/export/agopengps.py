@@ -41,7 +41,7 @@ def write_agopengps(field: Field, folder: Path, *, lines: str) -> None:
     west, south, east, north = field.wgs84("rows").total_bounds
     start = round((south + north) / 2, 7), round((west + east) / 2, 7)
     month = f"{date.fromisoformat(field.flown):%Y-%B-%d}"
-    header = [f"{month} 12:00:00 AM", "$FieldDir", field.parcel, "$Offsets", "0,0", "Convergence", "0", "StartFix"]
+    header = [f"{month} 12:00:00 AM", "$FieldDir", target.name, "$Offsets", "0,0", "Convergence", "0", "StartFix"]
     _write(paths.agopengps_file(target, "Field"), [*header, f"{start[0]},{start[1]}"])
 
     polygons = shapely.get_parts(shapely.force_2d(field.wgs84("outline").geometry.to_numpy()))

@@ -72,7 +72,7 @@ def export_products(
     wanted = lines if set(formats) - set(MESHES) else "rows"
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
     fields = [read_field(product, lines=wanted, **drawn) for product in products]
-    names = [field.parcel for field in fields]
+    names = [paths.safe(field.parcel) for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
     robot: dict[str, Any] = {"frame": frame, "grid": grid}
@@ -95,7 +95,7 @@ def export_products(
                 target, partial(write, field, **options), _record(field, kind, {"lines": lines} | drawn | options)
             )
         yield (
-            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(out / field.parcel)} "
+            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(target.parent)} "
             f"({', '.join(formats)})"
         )
 

@@ -5,157 +5,290 @@ from __future__ import annotations
 import difflib
 import unicodedata
 import warnings
-from typing import TYPE_CHECKING
+import zipfile
+from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
 import numpy as np
+import pandas as pd
 import pyogrio
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import project
+from vinemap.geo.crs import LOCAL, is_local, project
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
-    import pandas as pd
+    from numpy.typing import NDArray
     from pyproj import CRS
+    from shapely.geometry.base import BaseGeometry
 
 PARCEL_LAYER = "parcel"
-NAME_COLUMNS = ("parcel", "name", "label", "id", "code")
+WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
+"""Columns that are likely to name polygons, the likeliest first, and such as number them."""
+OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
+OF_KML |= {"draworder", "icon", "snippet"}
+"""Columns of every KML, which name nothing."""
+FORMATS = "GeoPackage, GeoJSON, KML, KMZ or Shapefile"
+ZIPPED = (".shp", ".gpkg", ".geojson", ".kml")
+"""Files of polygons in a ``.zip``."""
+MOST_NAMED = 5
+"""Things that are named where many are left out."""
 Boundary = tuple[shapely.Geometry, "CRS"]
 """A polygon and its CRS."""
 
 
+class Parcel(NamedTuple):
+    """The boundary of a parcel, and what is to be known of it: a sentence each."""
+
+    boundary: Boundary
+    remarks: tuple[str, ...] = ()
+
+
+class NoAreaError(InputError):
+    """Something in a file of polygons is none."""
+
+
+class _Table(NamedTuple):
+    """What a file holds."""
+
+    frame: gpd.GeoDataFrame
+    area: NDArray[np.bool_]
+    """Which of its rows have polygons."""
+    columns: dict[str, pd.Series]
+    """Those that may name them, as words: the likeliest first."""
+    usable: bool
+    """Whether the first one does, as far as it is filled in."""
+
+
 def read_boundary(path: Path, *, parcel: str | None = None) -> Boundary:
-    """Read the polygon of a parcel from GeoPackage, GeoJSON or Shapefile.
+    """Read the polygon of a parcel from GeoPackage, GeoJSON, KML, KMZ or Shapefile, or a ``.zip`` with one.
+
+    Parameters and errors are those of :func:`read_parcel`.
+    """
+    return read_parcel(path, parcel=parcel).boundary
+
+
+def read_parcel(path: Path, *, parcel: str | None = None, local: bool = False) -> Parcel:
+    """Read the polygon of a parcel, and what is to be known of it.
 
     Parameters
     ----------
     path : Path
-        File whose only layer of polygons, or whose layer ``parcel``, is read.
+        File whose only layer of polygons, or whose layer ``parcel``, is read; of KML all layers are.
     parcel : str, optional
-        Name that one of the polygon's columns holds, where there are several; without a name all of them count. The
-        column is that of :func:`read_parcels`, or the next one that holds the name.
+        Name that one of the polygon's columns holds; without a name all polygons count. The column is that of
+        :func:`read_parcels`, or the next one that holds the name.
+    local : bool
+        Whether coordinates are local, and need no CRS.
 
     Raises
     ------
     InputError
         If the file can't be read, has no polygon or no CRS, or none with the parcel's name.
     """
-    if parcel is None:
-        frame = _read_polygons(path)
-        return _polygon(frame.geometry, path), frame.crs
-    (found,) = read_parcels(path, [parcel]).values()
-    if isinstance(found, InputError):
-        raise found
-    return found
+    if parcel is not None:
+        (found,) = read_parcels(path, [parcel], local=local).values()
+        if isinstance(found, InputError):
+            raise found
+        return found
+    table = _read_table(path, local=local)
+    made = _parcel(table, np.arange(len(table.frame)), path)
+    others = [_described(table, row) for row in np.flatnonzero(~table.area).tolist()]
+    if others:
+        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        left = f"{path.name} holds what is no polygon, and is left out: {', '.join(others[:MOST_NAMED])}{more}"
+        return made._replace(remarks=(*made.remarks, left))
+    return made
 
 
-def read_parcels(path: Path, names: Sequence[str] | None = None) -> dict[str, Boundary | InputError]:
+def read_parcels(
+    path: Path, names: Sequence[str] | None = None, *, local: bool = False
+) -> dict[str, Parcel | InputError]:
     """Read the polygons of parcels, or what is wrong with one.
 
     Parameters
     ----------
     path : Path
-        As for :func:`read_boundary`.
+        As for :func:`read_parcel`.
     names : sequence of str, optional
-        Names of parcels; by default those in the first column, a likely one before others, that tells all polygons
-        apart. A single polygon is the parcel's, whatever it is called.
+        Names of parcels; by default those in a column in which no name stands twice: ``parcel``, ``name`` or ``label``,
+        if half of the polygons have one, which makes the others wrong alone; else a column that has one for each. A
+        single polygon that nothing names is the parcel's, whatever that is called.
+    local : bool
+        As for :func:`read_parcel`.
 
     Raises
     ------
     InputError
-        If the file can't be read, has no polygon or no CRS, or no column that has a name for each.
+        If the file can't be read, has no polygon or no CRS, or no column that names them.
     """
-    frame = _read_polygons(path)
-    columns = {name: _words(frame[name]) for name in _name_columns(frame)}
-    if names is None:
-        first = next(iter(columns.values()), None)
-        if first is None or not _tells_apart(first):
-            raise InputError(
-                f"{path}: no column has a name of its own for each of its {len(frame)} polygons: add one, 'name'"
-            )
-        names = list(first)
-    places = [words.groupby(words).indices for words in columns.values()]
-    found: dict[str, Boundary | InputError] = {}
-    for name in names:
-        word = unicodedata.normalize("NFC", name)
-        rows = next((place[word] for place in places if word in place), None) if len(frame) > 1 else [0]
-        try:
-            if rows is None:
-                raise _no_such(path, name, frame, columns.values())
-            found[name] = _polygon(frame.geometry.iloc[rows], path), frame.crs
-        except InputError as error:
-            found[name] = error
+    table = _read_table(path, local=local)
+    found: dict[str, Parcel | InputError] = {}
+    if names is not None:
+        for name in names:
+            found[name] = _found(table, name, path)
+        return found
+    if not table.usable:
+        n = np.count_nonzero(table.area)
+        raise InputError(f"{path}: no column has a name of its own for each of its {n} polygons: add one, 'name'")
+    column, words = next(iter(table.columns.items()))
+    for row, word in enumerate(words):
+        name = f"polygon {row + 1}" if pd.isna(word) else str(word)
+        if not table.area[row]:
+            found.setdefault(name, NoAreaError(f"{_described(table, row)} is no polygon"))
+        elif pd.isna(word):
+            found[name] = InputError(f"{path}: {name} has no name in column {column!r}: give it one")
+        else:
+            found[name] = _made(table, np.flatnonzero(words == word), path)
     return found
 
 
-def _no_such(path: Path, name: str, frame: gpd.GeoDataFrame, columns: Iterable[pd.Series]) -> InputError:
-    words = sorted({str(word) for column in columns for word in column.dropna()})
+def _found(table: _Table, name: str, path: Path) -> Parcel | InputError:
+    """The polygons of a name, or why there are none."""
+    word = unicodedata.normalize("NFC", name)
+    rows = next((np.flatnonzero(words == word) for words in table.columns.values() if (words == word).any()), None)
+    if rows is None and len(table.frame) == 1 and not _is_named(table, word):
+        rows = np.arange(1)
+    if rows is not None:
+        return _made(table, rows, path)
+    words = sorted({str(word) for column in table.columns.values() for word in column.dropna()})
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}?" if close else "check the name"
-    return InputError(f"{path}: none of its {len(frame)} polygons has {name!r} in a column: {hint}")
+    n = np.count_nonzero(table.area)
+    return InputError(f"{path}: none of its {n} polygons has {name!r} in a column: {hint}")
 
 
-def _polygon(shapes: gpd.GeoSeries, path: Path) -> shapely.Geometry:
-    """All of some shapes, valid and flat."""
-    polygon = _areas(shapely.make_valid(shapely.union_all(shapely.make_valid(shapes.to_numpy()))))
+def _is_named(table: _Table, asked: str) -> bool:
+    """Whether the only polygon has a name; numbers are names to those who ask for a number."""
+    likely = (words[0] for name, words in table.columns.items() if name.lower() in WORDS + NUMBERS)
+    return any(isinstance(word, str) and (not word.isdigit() or asked.isdigit()) for word in likely)
+
+
+def _made(table: _Table, rows: NDArray[np.int_], path: Path) -> Parcel | InputError:
+    try:
+        return _parcel(table, rows, path)
+    except InputError as error:
+        return error
+
+
+def _parcel(table: _Table, rows: NDArray[np.int_], path: Path) -> Parcel:
+    """All polygons of some rows, valid and flat."""
+    shapes = table.frame.geometry.to_numpy()[rows[table.area[rows]]]
+    if len(shapes) == 0:
+        raise NoAreaError(f"{_described(table, int(rows[0]))} is no polygon")
+    polygon = _areas(shapely.make_valid(shapely.union_all([_areas(shape) for shape in shapely.make_valid(shapes)])))
     if not np.isfinite(shapely.bounds(polygon)).all():
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
-    return shapely.force_2d(polygon)
+    kinds = [part.geom_type for shape in shapes for part in _parts(shape) if not isinstance(part, shapely.Polygon)]
+    beside = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
+    remarks = (f"of the boundary only polygons count, not what stands beside them ({beside})",) if kinds else ()
+    return Parcel((shapely.force_2d(polygon), table.frame.crs), remarks)
+
+
+def _parts(geometry: shapely.Geometry | None) -> list[BaseGeometry]:
+    """What a geometry is made of, down to the last collection in a collection."""
+    parts: list[BaseGeometry] = shapely.get_parts(geometry).tolist()
+    return [inner for part in parts for inner in _parts(part)] if hasattr(geometry, "geoms") else parts
 
 
 def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
-    """The polygons of a geometry, without the lines and points that are left of spikes and double edges."""
-    parts = shapely.get_parts(shapely.get_parts(geometry))
-    areas = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
+    """The polygons of a geometry, without points and lines, such as are left of spikes and double edges."""
+    parts = _parts(geometry)
+    areas = [part for part in parts if isinstance(part, shapely.Polygon)]
     return geometry if len(areas) == len(parts) else shapely.union_all(areas)
 
 
-def _name_columns(frame: gpd.GeoDataFrame) -> list[str]:
-    """Columns that may name polygons: such as have a name for each first, and of these, likely ones."""
-    columns = [str(name) for name in frame.columns if name != "geometry"]
-    return sorted(columns, key=lambda name: (not _tells_apart(_words(frame[name])), name.lower() not in NAME_COLUMNS))
+def _described(table: _Table, row: int) -> str:
+    """What a row is, in words."""
+    shape = table.frame.geometry[row]
+    kind = "an empty geometry" if shape is None or shape.is_empty else f"a {shape.geom_type}"
+    words = (words[row] for name, words in table.columns.items() if name.lower() in WORDS)
+    return next((f"{kind} {word!r}" for word in words if isinstance(word, str)), kind)
 
 
-def _words(column: pd.Series) -> pd.Series:
-    """Names as words, their Unicode composed, without those that are empty."""
-    words = column.dropna().astype(str).str.strip().str.normalize("NFC")
-    return words[words != ""].reindex(column.index)
-
-
-def _tells_apart(words: pd.Series) -> bool:
-    return bool(words.is_unique and words.notna().all())
-
-
-def _read_polygons(path: Path) -> gpd.GeoDataFrame:
+def _read_table(path: Path, *, local: bool = False) -> _Table:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GDAL's remarks on odd files
-            frame = gpd.read_file(path, layer=_polygon_layer(path))
+            frame = _read_layers(path)
     except InputError:
         raise
     except Exception as error:  # GDAL's errors come in several classes
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON or Shapefile ({reason})") from error
+        raise InputError(f"{path}: can't be read as {FORMATS} ({reason})") from error
+    if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
+        frame = frame.set_crs(LOCAL, allow_override=True)
     if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
         raise InputError(f"{path}: has no geometry or no CRS: save the polygons with their CRS")
-    frame = frame[frame.geom_type.isin(["Polygon", "MultiPolygon"])]
-    if len(frame) == 0:
+    area = np.array([any(isinstance(part, shapely.Polygon) for part in _parts(shape)) for shape in frame.geometry])
+    if not area.any():
         raise InputError(f"{path}: holds no polygon")
-    return frame
+    columns = {str(name): _words(frame[name]) for name in frame.columns if name != frame.geometry.name}
+    ranks = {name: _rank(name, words[area]) for name, words in columns.items() if name.lower() not in OF_KML}
+    usable = min(ranks.values(), default=USELESS) < USELESS
+    return _Table(frame, area, {name: columns[name] for name in sorted(ranks, key=ranks.__getitem__)}, usable)
 
 
-def _polygon_layer(path: Path) -> str:
-    kinds = {str(name): str(kind) for name, kind in pyogrio.list_layers(path)}
+USELESS = (9, 0)
+
+
+def _rank(column: str, words: pd.Series) -> tuple[int, int]:
+    """How well a column names polygons: the less, the better."""
+    known, column = words.dropna(), column.lower()
+    filled = len(known) / len(words)
+    kinds = [(WORDS, 1.0), (WORDS, 0.5), (NUMBERS, 1.0), ((column,), 1.0)]
+    if known.is_unique:
+        for rank, (names, least) in enumerate(kinds):
+            if column in names and filled >= least:
+                return rank, names.index(column)
+    likely = (WORDS + NUMBERS).index(column) if column in WORDS + NUMBERS else 8
+    return USELESS[0], likely
+
+
+def _words(column: pd.Series) -> pd.Series:
+    """Names as words, their Unicode composed, None where there is none; whole numbers without decimals."""
+    if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
+        column = column.astype("Int64")
+    words = column.dropna().astype(str).str.split().str.join(" ").str.normalize("NFC")
+    return words[words != ""].reindex(column.index).astype(object)
+
+
+def _read_layers(path: Path) -> gpd.GeoDataFrame:
+    source = _inside(path)
+    kinds = {str(name): str(kind) for name, kind in pyogrio.list_layers(source)}
     polygons = [name for name, kind in kinds.items() if "Polygon" in kind] or list(kinds)
+    if path.suffix.lower() in (".kml", ".kmz"):  # whose folders are layers
+        tables = [gpd.read_file(source, layer=name) for name in polygons]
+        return pd.concat([table for table in tables if len(table)] or tables, ignore_index=True)
     if len(polygons) > 1 and PARCEL_LAYER not in polygons:
         raise InputError(f"{path}: has several layers of polygons ({', '.join(polygons)}): save the parcels' alone")
-    return PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0]
+    return gpd.read_file(source, layer=PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0])
+
+
+def _inside(path: Path) -> str:
+    """A file as GDAL finds it, or the one of polygons in a ``.zip``."""
+    if path.suffix.lower() != ".zip":
+        return str(path)
+    inner = polygons_in(path)
+    if len(inner) != 1:
+        known = ", ".join(inner) or "none"
+        raise InputError(f"{path}: holds {len(inner)} files of polygons ({known}), and must hold one: unpack it")
+    return f"/vsizip/{path}/{inner[0]}"
+
+
+def polygons_in(path: Path) -> list[str]:
+    """Names of the files of polygons in a ``.zip``; none of what is no such file."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = packed.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return []
+    return [name for name in names if name.lower().endswith(ZIPPED) and not name.startswith("__MACOSX")]
 
 
 def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import __version__, paths
-from vinemap.config.names import check_name
+from vinemap.config.names import check_parcel
 from vinemap.errors import ConfigError, InputError
-from vinemap.geo.boundaries import read_parcels
-from vinemap.geo.crs import parse_crs
+from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
+from vinemap.geo.crs import is_local, parse_crs
 from vinemap.parcel import in_words
 from vinemap.product.recipe import Recipe, Source, flown, product_in, read_source
 from vinemap.product.store import write_whole
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from vinemap.config.surveys import SurveyConfig
-    from vinemap.geo.boundaries import Boundary
 
-DONE, CURRENT, OUTSIDE, FAILED = "done", "up to date", "not in the cloud", "failed"
+DONE, CURRENT, OUTSIDE, LEFT, FAILED = "done", "up to date", "not in the cloud", "left out", "failed"
 """What can become of a parcel."""
 
 
@@ -89,30 +88,40 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
     hashed, known = _earlier(folder)
-    polygons: dict[str, Boundary | InputError | None]
+    polygons: dict[str, Parcel | InputError | None]
+    crs, listed = parse_crs(config.crs) if config.crs else None, config.parcels is not None
     sources: tuple[Source, ...]
     if config.boundaries is None and config.parcels is None and not boundaries.exists():
         sources, polygons = (read_source(cloud, hashed),), {config.survey: None}
     else:
         sources = read_source(cloud, hashed), read_source(boundaries, hashed)
-        polygons = {**read_parcels(boundaries, config.parcels)}
-    crs, date, listed = parse_crs(config.crs) if config.crs else None, flown(sources[0]), config.parcels is not None
+        polygons = {**read_parcels(boundaries, config.parcels, local=crs is not None and is_local(crs))}
+    date = flown(sources[0])
     plan = Plan(sources, date, [], [], listed)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
+    taken: dict[Path, str] = {}
     for name, polygon in polygons.items():
+        if isinstance(polygon, InputError):
+            state = LEFT if isinstance(polygon, NoAreaError) and not listed else FAILED
+            plan.settled.append(Outcome(name, state, reason=str(polygon)))
+            continue
         try:
-            parcel = check_name(name)
+            parcel = check_parcel(name)
         except ConfigError as error:
             plan.settled.append(Outcome(name, FAILED, reason=str(error)))
             continue
-        if isinstance(polygon, InputError):
-            plan.settled.append(Outcome(parcel, FAILED, reason=str(polygon)))
+        place = paths.parcel_folder(folder, parcel)
+        if (other := taken.setdefault(paths.alike(place), parcel)) != parcel:
+            reason = f"its folder would be that of {other!r}, {place.name}: give one of the two another name"
+            plan.settled.append(Outcome(parcel, FAILED, reason=reason))
             continue
         own = config.of_parcel(parcel)
-        recipe = Recipe(parcel, cloud, sources, polygon, own.settings, crs, own.origin, date, config.survey)
+        boundary, remarks = polygon or (None, ())
+        made_of = parcel, cloud, sources, boundary, own.settings, crs, own.origin, date, config.survey, remarks
+        recipe = Recipe(*made_of)
         key = recipe.key
-        product = None if again else product_in(folder / parcel)
+        product = None if again else product_in(place)
         if product and (product.key, product.parcel) == (key, parcel):
             numbers = product.rows, product.length, 0.0
             plan.settled.append(Outcome(parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key))

@@ -231,9 +231,10 @@ def _run(
     """Have a parcel worked, and tell what became of it."""
     began = time.perf_counter()
     failed = partial(Outcome, recipe.parcel, FAILED, key=recipe.key)
+    target = paths.parcel_folder(folder, recipe.parcel)
     options = {"piece": piece, "drafts": aside, "within": folder, "limit": limit}
     try:
-        summary: Summary = step(recipe.parcel, workers.run, follow, recipe, folder / recipe.parcel, **options)
+        summary: Summary = step(recipe.parcel, workers.run, follow, recipe, target, **options)
     except OutsideError as error:
         return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
     except VinemapError as error:

@@ -15,7 +15,8 @@ from vinemap import __version__, paths
 from vinemap.cloud.files import date_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
-from vinemap.geo.boundaries import read_boundary
+from vinemap.geo.boundaries import read_parcel
+from vinemap.geo.crs import is_local
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -172,9 +173,13 @@ def recipe_of(
     InputError
         If the cloud or the boundary can't be read.
     """
-    polygon = read_boundary(boundary, parcel=parcel if named else None) if boundary else None
+    local = crs is not None and is_local(crs)
+    found = read_parcel(boundary, parcel=parcel if named else None, local=local) if boundary else None
+    polygon, remarks = found or (None, ())
     sources = tuple(read_source(path) for path in (cloud, boundary) if path)
-    return Recipe(parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]), survey)
+    return Recipe(
+        parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]), survey, remarks
+    )
 
 
 def flown(cloud: Source) -> datetime:

@@ -114,7 +114,7 @@ def parcel_item(
     if (page := paths.report(folder, parcel)).exists():
         item.add_asset("report", _asset(page, folder, "Map, table, plots and canopies in 3D", role="overview"))
     for path in sorted(folder.glob("*.tif")):
-        kind = path.stem.removeprefix(f"{parcel}_")
+        kind = path.stem.removeprefix(f"{paths.safe(parcel)}_")
         _add_raster(item, kind, path)
         if (style := paths.raster_style(path)).exists():
             item.add_asset(f"{kind}_style", _asset(style, folder, "Its colours in QGIS", role="style"))
@@ -256,7 +256,7 @@ def _parcels(folder: Path, survey: str) -> Iterator[_Parcel]:
             flown = datetime.fromisoformat(item["properties"]["datetime"]).astimezone(UTC)
         except (OSError, ValueError, KeyError, TypeError):
             continue
-        yield _Parcel(product.name, path, (west, south, east, north), flown)
+        yield _Parcel(item["properties"]["title"], path, (west, south, east, north), flown)
 
 
 def save(described: pystac.Item | pystac.Collection, path: Path) -> None:

@@ -75,7 +75,7 @@ def write_index(folder: Path, survey: str) -> bool:
         If it can't be written.
     """
     known = _outcomes(folder)
-    products = {product.folder.name: product for product in read_products(folder) if product.survey == survey}
+    products = {product.parcel: product for product in read_products(folder) if product.survey == survey}
     if not products and not known:
         return False
     earlier = find_earlier(products, folder)
