@@ -25,6 +25,9 @@ from vinemap.jobs.estate import Arrival, arrivals
 from vinemap.jobs.plan import FAILED, Outcome, plan_survey
 from vinemap.jobs.survey import map_survey
 
+PASSED = "passed over"
+"""State of a file that can't be used."""
+
 
 class Night(NamedTuple):
     """What became of a survey, or why nothing did."""
@@ -33,12 +36,15 @@ class Night(NamedTuple):
     outcomes: list[Outcome]
     reason: str = ""
     failed: bool = False
+    passed: tuple[str, ...] = ()
+    """What lies beside it and can't be used."""
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Rows of a table: one a parcel, or one for all that ended alike without being worked."""
+        """Rows of a table: one a parcel, or one for all that ended alike without being worked, and what was passed."""
+        passed = [(self.survey, "", "", "", PASSED, remark) for remark in self.passed]
         if self.reason:
-            return [(self.survey, "", "", "", FAILED if self.failed else "waits", self.reason)]
-        return [(self.survey, *row) for row in rows_of(self.outcomes)]
+            return [(self.survey, "", "", "", FAILED if self.failed else "waits", self.reason), *passed]
+        return [*((self.survey, *row) for row in rows_of(self.outcomes)), *passed]
 
 
 @flow(name="nightly", persist_result=False)
@@ -54,10 +60,12 @@ def nightly(config: str = str(paths.ESTATE)) -> State[list[Night]]:
     estate = load_estate(Path(config))
     nights = []
     for arrival in arrivals(estate):
-        night = _survey(arrival, estate.products / arrival.name)
+        night = _survey(arrival, estate.products / arrival.name)._replace(passed=arrival.passed)
         nights.append(night)
         if night.reason:
             (log.error if night.failed else log.info)("%s: %s", night.survey, night.reason)
+        for remark in night.passed:
+            log.warning("%s: %s", night.survey, remark)
     table = [dict(zip(("survey", *COLUMNS), row, strict=True)) for night in nights for row in night.rows()]
     create_table_artifact(table, key="nightly")
     failed = [night.survey for night in nights if night.failed]

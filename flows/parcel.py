@@ -63,8 +63,8 @@ def ensure_cloud(config: SurveyConfig) -> None:
     InputError
         If the cloud of a real survey is missing.
     """
-    cloud = config.cloud or paths.survey_cloud(config.survey)
-    if cloud.is_file():
+    cloud = paths.survey_cloud(config.survey)
+    if config.cloud or cloud.is_file():
         return
     if config.simulate is None:
         raise InputError(f"{cloud}: no such file: put the cloud of survey {config.survey} there, or name it as 'cloud'")

@@ -48,7 +48,7 @@ from vinemap.surfaces.ground import terrain_model
 from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     import geopandas as gpd
@@ -167,7 +167,7 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
 
 
 def map_parcel(
-    cloud: Path,
+    cloud: Path | Sequence[Path],
     folder: Path,
     *,
     parcel: str,
@@ -182,8 +182,8 @@ def map_parcel(
 
     Parameters
     ----------
-    cloud : Path
-        LAS, LAZ or COPC file.
+    cloud : Path or sequence of Path
+        LAS, LAZ or COPC files, worked as one, or folders of such.
     folder : Path
         Where the product goes, whole or not at all.
     parcel : str
@@ -313,10 +313,10 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., A
         return points
     how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
     if settings.ground.engine == "pdal":
-        points = run("Reading", read_cloud_pdal, recipe.cloud, **how)
+        points = run("Reading", read_cloud_pdal, recipe.clouds, **how)
     else:
-        points = run("Reading", read_cloud, recipe.cloud, collector=collector, **how)
-    recipe.sources[0].check()
+        points = run("Reading", read_cloud, recipe.clouds, collector=collector, **how)
+    recipe.check()
     return points
 
 

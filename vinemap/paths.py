@@ -6,6 +6,10 @@ import os
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 DATA = Path("data")
 LONGEST_NAME = 64
@@ -46,6 +50,12 @@ def stem(cloud: Path) -> str:
     """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
     name = re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))
     return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ") or "cloud"
+
+
+def named_by(clouds: Sequence[Path]) -> str:
+    """What a survey is called after its files: a single one, or the folder that holds them all."""
+    folders = {cloud.resolve().parent for cloud in clouds}
+    return stem(clouds[0] if len(clouds) == 1 or len(folders) > 1 else folders.pop())
 
 
 def configuration(survey: str) -> Path:

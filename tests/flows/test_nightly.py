@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import laspy
 import pytest
 from place import ROOT, Place, wait
 
@@ -81,18 +82,23 @@ def test_a_night_does_what_can_be_done_and_says_why_the_rest_cannot(survey, home
         arrive(survey, tmp_path / "in", name)
     cut = tmp_path / "in" / "cut" / "small.laz"
     cut.write_bytes(cut.read_bytes()[:-5000])
-    shutil.copy(tmp_path / "in" / "two" / "small.laz", tmp_path / "in" / "two" / "other.laz")
+    las = laspy.read(tmp_path / "in" / "two" / "small.laz")
+    (tmp_path / "in" / "two" / "small.laz").unlink()
+    for k in range(2):
+        las[list(range(k, len(las), 2))].write(tmp_path / "in" / "two" / f"tile {k}.laz")
+    (tmp_path / "in" / "two" / "flight.e57").write_bytes(b"ASTM-E57")
     (tmp_path / "in" / "noise.laz").write_bytes(b"no cloud" * 100)
     code, rows, errors = ended(start(tmp_path, home))
     assert code == 1
-    assert errors == "vinemap: 2 of 4 surveys failed, or parcels of theirs: noise, two\n"
+    assert errors == "vinemap: 1 of 4 surveys failed, or parcels of theirs: noise\n"
     states = {row[0]: " ".join(row[1:]) for row in rows}
     assert "ends before its table of chunks" in states["cut"]
     assert "noise.laz: can't be read as LAS or LAZ" in states["noise"]
-    assert "holds 2 clouds: name one in its survey.yaml" in states["two"]
+    assert states["two"] == "passed over flight.e57 can't be read: save it as LAS or LAZ"
+    assert json.loads((tmp_path / "out" / "two" / "A" / "run.json").read_text())["counts"]["rows"] == 6
     record = json.loads((tmp_path / "out" / "good" / "A" / "run.json").read_text())
     assert record["settings"]["polygon"]["c"] == 9
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"good", "noise"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"good", "noise", "two"}
 
 
 def test_surveys_that_are_dropped_in_are_mapped_on_schedule(survey, tmp_path):

@@ -3,9 +3,11 @@
 import os
 import shutil
 import time
+import zipfile
 from pathlib import Path
 
 import geopandas as gpd
+import laspy
 import pytest
 import shapely
 from systems import POSIX
@@ -51,8 +53,6 @@ def test_surveys_are_files_and_folders(clouds, place):
     put(clouds["las 1.2"], place / "Àugust.LAS")
     polygons(place / "june" / "anything.gpkg")
     (place / "empty").mkdir()
-    (place / "later").mkdir()
-    polygons(place / "later" / "parcels.gpkg")
     (place / "notes.txt").touch()
     surveys = {arrival.name: arrival.config for arrival in found(place)}
     assert list(surveys) == sorted(surveys) == ["july", "june", "may", "Àugust"]
@@ -63,10 +63,77 @@ def test_surveys_are_files_and_folders(clouds, place):
     assert surveys["may"].boundaries is None
 
 
-@pytest.mark.parametrize("name", [".may.laz", ".may", "may.laz.part", "may.laz.filepart", "may.tmp", "may.zip"])
+@pytest.mark.parametrize("name", [".may.laz", ".may", "may.txt", "may.tif", "parcels.gpkg"])
 def test_what_is_hidden_or_something_else_is_left_out(clouds, place, name):
     put(clouds["laz 1.4"], place / name / "a.laz" if name == ".may" else place / name)
     assert found(place) == []
+
+
+@pytest.mark.parametrize("folder", ["", "may"])
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("may.zip", "unpack it"),
+        ("may.tar.gz", "unpack it"),
+        ("may.e57", "save it as LAS or LAZ"),
+        ("may.PLY", "save it as LAS or LAZ"),
+        ("may.laz.part", "is its upload over?"),
+        ("may.las.filepart", "is its upload over?"),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_what_to_do(clouds, place, folder, name, told):
+    path = place / folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"something")
+    os.utime(path, (NOW - 1000, NOW - 1000))
+    (arrival,) = found(place)
+    assert str(path) in arrival.reason
+    assert told in arrival.reason
+    assert arrival.waits is ("upload" in told)
+    os.utime(path, (NOW - 2 * estate.LATE, NOW - 2 * estate.LATE))
+    assert not found(place)[0].waits
+    if folder:
+        put(clouds["laz 1.4"], place / "may" / "a.laz")
+        (arrival,) = found(place)
+        assert arrival.config.cloud == place / "may" / "a.laz"
+        (passed,) = arrival.passed
+        assert passed.startswith(name)
+
+
+def test_a_survey_waits_for_the_last_of_its_files(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "b.laz.part")
+    assert found(place)[0].waits
+
+
+def test_polygons_wait_for_their_cloud(place):
+    (place / "may").mkdir()
+    polygons(place / "may" / "parcels.gpkg")
+    (arrival,) = found(place)
+    assert arrival.waits
+    assert arrival.reason == f"{place / 'may'}: holds polygons, but no cloud: put LAS or LAZ there"
+
+
+def test_clouds_in_deeper_folders_are_told(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "lidars" / "terra" / "a.laz", place / "may" / ".trash" / "b.laz")
+    assert "its clouds lie in lidars/terra: move them up, or say 'cloud: lidars/terra'" in reasons(place)["may"]
+    (place / "may" / "survey.yaml").write_text("cloud: lidars/terra\n")
+    assert found(place)[0].config.cloud == place / "may" / "lidars" / "terra"
+    put(clouds["laz 1.4"], place / "june" / "a.laz", place / "june" / "old" / "b.laz")
+    assert found(place)[0].passed == ("old holds clouds, too: move them up",)
+
+
+@pytest.mark.parametrize("name", ["p.kml", "p.kmz", "p.zip", "p.geojson", "p.json", "p.SHP"])
+def test_polygons_of_any_kind_are_a_surveys(clouds, place, name):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    path = place / "may" / name
+    if name == "p.zip":
+        with zipfile.ZipFile(path, "w") as packed:
+            packed.writestr("fields/p.shp", "")
+    else:
+        path.write_text('{"type": "FeatureCollection"}')
+    (place / "may" / "report.json").write_text('{"points": 5}')
+    (arrival,) = found(place)
+    assert (arrival.config.boundaries, arrival.passed) == (path, ())
 
 
 def test_hidden_files_of_a_survey_are_left_out(clouds, place):
@@ -129,12 +196,25 @@ def test_a_clock_that_is_ahead_holds_nothing_up(clouds, place):
     assert found(place)[0].waits
 
 
-def test_two_clouds(clouds, place):
+def test_several_clouds_are_one(clouds, place):
     put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "b.las")
-    said = f"{place / 'may'}: holds 2 clouds: name one in its survey.yaml, as 'cloud: FILE'"
-    assert reasons(place) == {"may": said}
+    assert found(place)[0].config.cloud == [place / "may" / "a.laz", place / "may" / "b.las"]
     (place / "may" / "survey.yaml").write_text("cloud: a.laz\n")
     assert found(place)[0].config.cloud == place / "may" / "a.laz"
+    (place / "may" / "survey.yaml").write_text("cloud: [b.las, a.laz]\n")
+    assert found(place)[0].config.cloud == [place / "may" / "b.las", place / "may" / "a.laz"]
+    os.truncate(place / "may" / "a.laz", 5000)
+    assert "ends before its table of chunks" in found(place)[0].reason
+
+
+@pytest.mark.parametrize("folder", ["", "june"])
+def test_a_cloud_in_two_formats_is_one(clouds, place, folder):
+    put(clouds["laz 1.4"], place / folder / "june.laz", place / folder / "june.copc.laz")
+    put(clouds["las 1.4"], place / folder / "june.las")
+    assert found(place)[0].config.cloud == place / folder / "june.copc.laz"
+    laspy.read(clouds["las 1.4"])[:1000].write(place / folder / "june.las")
+    (arrival,) = found(place)
+    assert "hold another number of points: keep the one that is right" in arrival.reason
 
 
 def test_several_files_of_polygons(clouds, place):
@@ -152,14 +232,12 @@ def test_several_files_of_polygons(clouds, place):
 
 
 def test_two_of_one_name(clouds, place):
-    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may.laz", place / "june.las", place / "june.copc.laz")
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may.laz", place / "june.laz")
     first = {arrival.name: arrival for arrival in found(place)}
     assert first["may"].config.cloud == place / "may" / "a.laz"
     assert first["may.laz"].reason == f"{place / 'may.laz'} has the name of {place / 'may'}: give it another"
-    assert first["june"].config.cloud == place / "june.copc.laz"
-    assert not first["june.las"].config
-    assert not first["june.las"].waits
-    assert len(first) == 4
+    assert first["june"].config.cloud == place / "june.laz"
+    assert len(first) == 3
 
 
 def test_an_empty_folder_takes_no_name(clouds, place):
@@ -222,8 +300,9 @@ def test_its_own_file(clouds, place):
         ("cluod: a.laz", "unknown key cluod: did you mean 'cloud'?"),
         ("settle: 5", "unknown key settle"),
         ("cloud: b.laz", "b.laz: no such file"),
-        ("cloud: .", "no such file"),
-        ("cloud: [a.laz]", "no such file"),
+        ("cloud: ../..", "holds no LAS, LAZ or COPC file"),
+        ("cloud: [a.laz, b.laz]", "b.laz: no such file"),
+        ("cloud: []", "holds no cloud"),
         ('cloud: "a\\0b.laz"', "no such file"),
         ("cloud: " + "x" * 300, ""),
         ("boundaries: b.gpkg", "b.gpkg: no such file"),

@@ -360,7 +360,7 @@ def needs_points(one, folder, *, piece=None, **options):
     if piece:
         read_piece(piece, Collector())
     else:
-        read_cloud(one.cloud, boundary=one.boundary)
+        read_cloud(one.clouds, boundary=one.boundary)
     return doubles.follow(one, folder, piece=piece, **options)
 
 
@@ -482,9 +482,9 @@ def test_a_cloud_that_vanishes_once_it_was_read(job):
 def test_a_cloud_that_vanishes_while_it_is_read(job, monkeypatch):
     """It isn't wrong for good."""
 
-    def split(cloud, *args, **kwargs):
-        pieces = split_cloud(cloud, *args, **kwargs)
-        cloud.rename(cloud.with_name("away"))
+    def split(clouds, *args, **kwargs):
+        pieces = split_cloud(clouds, *args, **kwargs)
+        job.cloud.rename(job.cloud.with_name("away"))
         return pieces
 
     with monkeypatch.context() as patch:

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("cloud", type=FILE)
-@click.option("--boundary", type=FILE, help="Polygon to clip to: GeoPackage, GeoJSON or Shapefile, in any CRS.")
-@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none or a wrong one.")
+@click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
+@click.option("--boundary", type=FILE, help="Polygon to clip to: GeoPackage, GeoJSON, KML or Shapefile, in any CRS.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--parcel", help="Name of the parcel; the cloud's by default.")
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
 @click.option("--origin", type=OriginParam(), help="Origin of the local frame {Main}; the parcel's corner by default.")
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.option("--classified", is_flag=True, help="Write the points with a class and a row each, too.")
 @click.option("--plain", is_flag=True, help="Write meshes for readers of glTF that know no extension: larger files.")
 def run(
-    cloud: Path,
+    clouds: tuple[Path, ...],
     boundary: Path | None,
     crs: str | None,
     parcel: str | None,
@@ -34,15 +34,17 @@ def run(
     classified: bool,
     plain: bool,
 ) -> None:
-    """Map the rows and canopies in CLOUD (LAS, LAZ or COPC)."""
+    """Map the rows and canopies in CLOUD: LAS, LAZ or COPC files, worked as one, or folders of such."""
     from vinemap import paths
+    from vinemap.cloud.files import cloud_files
     from vinemap.config.names import check_parcel
     from vinemap.config.settings import Settings
     from vinemap.config.surveys import load_settings
     from vinemap.geo.crs import parse_crs
 
-    name = check_parcel(parcel) if parcel is not None else paths.stem(cloud)
-    folder = out or paths.product_folder(paths.stem(cloud), name)
+    survey = paths.named_by(cloud_files(clouds))
+    name = check_parcel(parcel) if parcel is not None else survey
+    folder = out or paths.product_folder(survey, name)
     chosen = load_settings(settings) if settings else Settings()
     extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}
     options = {
@@ -55,5 +57,5 @@ def run(
     with progress(name) as step:
         from vinemap.parcel import map_parcel
 
-        summary = map_parcel(cloud, folder, parcel=name, step=step, **options)
+        summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
     click.echo(summary.line())

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("cloud", type=FILE)
+@click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
 @click.option("--boundaries", type=FILE, required=True, help="Polygons of the parcels, named in one of their columns.")
 @click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
-@click.option("--crs", help="CRS of the cloud, as EPSG:n, where the file states none or a wrong one.")
+@click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
 @click.option("--origin", type=OriginParam(), help="Origin of the local frame {Main}; each parcel's corner by default.")
 @click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @click.option("--engine", type=click.Choice(["processes", "dask"]), help="What works the parcels; processes here.")
 @click.option("--scheduler", help="Address of the Dask scheduler, as tcp://host:8786.")
 def survey(
-    cloud: Path,
+    clouds: tuple[Path, ...],
     boundaries: Path,
     parcels: tuple[str, ...],
     crs: str | None,
@@ -38,16 +38,17 @@ def survey(
     again: bool,
     **job: Any,
 ) -> None:
-    """Map many parcels of CLOUD (LAS, LAZ or COPC) in one job; exit code 1 if one of them fails."""
+    """Map many parcels of CLOUD (LAS, LAZ or COPC files, or folders) in one job; exit code 1 if one of them fails."""
     from vinemap import paths
+    from vinemap.cloud.files import cloud_files
     from vinemap.config.surveys import load_settings, survey_config
     from vinemap.jobs.plan import FAILED
     from vinemap.jobs.survey import map_survey
 
-    name = paths.stem(cloud)
+    name = paths.named_by(cloud_files(clouds))
     config = survey_config(
         survey=name,
-        cloud=cloud,
+        cloud=list(clouds),
         boundaries=boundaries,
         parcels=list(parcels) or None,
         crs=crs,

@@ -84,7 +84,11 @@ class SurveyConfig(_Surveys):
     """A survey: its cloud, its parcels and the settings for all of them."""
 
     survey: Name = Field(description="name; its data lie in data/surveys/<survey>")
-    cloud: Path | None = Field(None, description="LAS, LAZ or COPC file; data/surveys/<survey>/<survey>.laz by default")
+    cloud: Path | list[Path] | None = Field(
+        None,
+        description="LAS, LAZ or COPC file, folder of such, or a list of both, worked as one; "
+        "data/surveys/<survey>/<survey>.laz by default",
+    )
     simulate: Literal["barolo"] | None = Field(None, description="example to simulate where the cloud is missing")
 
     @model_validator(mode="after")
@@ -106,7 +110,7 @@ class EstateConfig(_Surveys):
     timezone: str = Field("UTC", description="time zone of that, as Europe/Rome")
     _given: dict[str, Any] = PrivateAttr(default_factory=dict)
 
-    def of_survey(self, name: str, own: Path | None, **files: Path | None) -> SurveyConfig:
+    def of_survey(self, name: str, own: Path | None, **files: Path | list[Path] | None) -> SurveyConfig:
         """What holds for a survey with the ``files`` that were found, whose ``own`` file may state otherwise.
 
         Raises
@@ -119,7 +123,7 @@ class EstateConfig(_Surveys):
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
-            stated |= {key: own.parent / str(stated[key]) for key in ("cloud", "boundaries") if stated.get(key)}
+            stated |= {key: _beside(own, stated[key]) for key in ("cloud", "boundaries") if stated.get(key)}
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}
@@ -127,6 +131,11 @@ class EstateConfig(_Surveys):
                 key: own for key, own in overrides.items() if unicodedata.normalize("NFC", str(key)) in composed
             }
         return validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
+
+
+def _beside(own: Path, named: Any) -> Any:
+    """Files that a survey's own file names, from its folder on."""
+    return [own.parent / str(one) for one in named] if isinstance(named, list) else own.parent / str(named)
 
 
 def choose_parcel(config: SurveyConfig, name: str) -> str:

@@ -6,20 +6,37 @@ import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
+from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, name_of, once
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
+from vinemap.geo.boundaries import polygons_in
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from vinemap.config.surveys import EstateConfig, SurveyConfig
 
-CLOUDS = (".las", ".laz")
-POLYGONS = (".gpkg", ".geojson", ".shp")
+POLYGONS = (".gpkg", ".geojson", ".kml", ".kmz", ".shp", ".json", ".zip")
+"""Files of polygons; what is in the last two kinds must be seen."""
+FEATURES = b"FeatureCollection"
+"""What stands in the beginning of GeoJSON."""
+BEGINNING = 4096
+"""Bytes of it."""
 USUAL = ("parcels", "boundaries", "boundary")
 """What the file of the parcels' polygons is called where there are others."""
+UNUSABLE = {
+    "can't be read: unpack it": (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"),
+    "can't be read: save it as LAS or LAZ": (
+        *(".e57", ".ply", ".pts", ".ptx", ".xyz", ".pcd", ".rcp", ".rcs", ".fls", ".zfs", ".zlas", ".lsproj"),
+    ),
+}
+"""What to do with files that hold clouds in another form."""
+PARTIAL = (".part", ".partial", ".filepart", ".crdownload", ".download", ".opdownload", ".tmp", ".aria2", ".!ut")
+"""How files end that are no whole uploads."""
+DEEP = ("*/*", "*/*/*", "*/*/*/*")
+"""Where clouds are looked for in a folder that has none at its top."""
 LATE = 86_400
 """Seconds after which what isn't whole is no upload any more."""
 
@@ -34,12 +51,27 @@ class Arrival(NamedTuple):
     """Why not."""
     waits: bool = False
     """Whether it only isn't there as a whole yet."""
+    passed: tuple[str, ...] = ()
+    """What lies beside it and can't be used, with what to do: a sentence each."""
+
+
+class _Found(NamedTuple):
+    """Files of a survey."""
+
+    clouds: Sequence[Path]
+    polygons: Sequence[Path]
+    own: Path | None
+    unusable: dict[Path, str]
+    partial: Sequence[Path]
+    deeper: Sequence[Path]
+    """Folders in its own in which there are clouds."""
 
 
 def arrivals(estate: EstateConfig, *, now: float | None = None) -> Iterator[Arrival]:
-    """Look through an estate's folder: each LAS, LAZ or COPC file in it is a survey, and each folder that holds one.
+    """Look through an estate's folder: each LAS, LAZ or COPC file in it is a survey, and each folder that holds some.
 
-    Names that begin with a dot are left out, as tools of upload choose them for what isn't whole.
+    Files in one folder are worked as one: tiles, flights. What can't be used, but may be meant to be, is named. Names
+    that begin with a dot are left out, as tools of upload choose them for what isn't whole.
 
     Parameters
     ----------
@@ -58,54 +90,138 @@ def arrivals(estate: EstateConfig, *, now: float | None = None) -> Iterator[Arri
         found = sorted(estate.surveys.iterdir())
     except OSError as error:
         raise InputError(f"{estate.surveys}: can't be read ({error.strerror}): make it, or name another") from error
-    for path in found:
-        if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in CLOUDS):
-            continue
-        name = path.name if path.is_dir() else path.stem.removesuffix(".copc")
+    for name, group in _surveys(found):
+        path = group[0]
         try:
-            name = check_name(name)
-            if name in seen:
-                yield Arrival(path.name, None, f"{path} has the name of {seen[name]}: give it another")
+            known = check_name(name)
+            if known in seen:
+                yield Arrival(path.name, None, f"{path} has the name of {seen[known]}: give it another")
                 continue
-            seen[name] = path
-            if arrival := _arrival(name, path, estate, now or time.time()):
+            seen[known] = path
+            if arrival := _arrival(known, group, estate, now or time.time()):
                 yield arrival
             else:
-                del seen[name]
+                del seen[known]
         except VinemapError as error:
             yield Arrival(paths.shown(path.name), None, str(error))
         except OSError as error:
             yield Arrival(path.name, None, f"{path}: can't be read ({error.strerror})")
 
 
-def _arrival(name: str, path: Path, estate: EstateConfig, now: float) -> Arrival | None:
-    """The survey of a folder or file; None if a folder holds nothing of one yet."""
-    files = [path] if path.is_file() else [p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")]
-    clouds = [p for p in files if p.suffix.lower() in CLOUDS]
-    polygons = [p for p in files if p.suffix.lower() in POLYGONS]
-    if len(polygons) > 1:
-        polygons = [p for p in polygons if p.stem.lower() in USUAL] or polygons
-    own = path / paths.OWN_CONFIGURATION if path.is_dir() and (path / paths.OWN_CONFIGURATION).is_file() else None
-    if not clouds and not own:
-        return None
-    config = estate.of_survey(name, own, cloud=_only(clouds), boundaries=_only(polygons))
-    for found, kind, chosen in ((clouds, "clouds", config.cloud), (polygons, "files of polygons", config.boundaries)):
-        if len(found) > 1 and not chosen:
-            key = "cloud" if found is clouds else "boundaries"
-            raise InputError(
-                f"{path}: holds {len(found)} {kind}: name one in its {paths.OWN_CONFIGURATION}, as '{key}: FILE'"
-            )
+def _surveys(found: Iterable[Path]) -> Iterator[tuple[str, list[Path]]]:
+    """Folders, and files of one name, that may be surveys."""
+    groups: dict[tuple[str, bool], list[Path]] = {}
+    for path in found:
+        if path.name.startswith("."):
+            continue
+        folder = path.is_dir()
+        if not folder and path.suffix.lower() in CLOUDS:
+            groups.setdefault((name_of(path), False), []).append(path)
+        elif folder or path.suffix.lower() in PARTIAL or _unusable(path):
+            groups[path.name, folder] = [path]
+    for (name, _), group in groups.items():
+        yield name, group
+
+
+def _arrival(name: str, group: list[Path], estate: EstateConfig, now: float) -> Arrival | None:
+    """The survey of a folder or of files; None if a folder holds nothing of one."""
+    folder = group[0] if group[0].is_dir() else None
+    if not folder and not all(path.is_file() for path in group):
+        raise InputError(f"{group[0]}: can't be read: it is no file")
+    found = _found(folder.iterdir() if folder else group, folder)
+    passed = [f"{path.name} {why}" for path, why in found.unusable.items()]
+    passed += [f"{path.name} holds clouds, too: move them up" for path in found.deeper]
+    for path in found.partial:
+        age = now - path.stat().st_mtime
+        reason = f"{path}: is no whole file: is its upload over?"
+        if age < LATE or not found.clouds:
+            return Arrival(name, None, reason, waits=age < LATE, passed=tuple(passed))
+        passed.append(f"{path.name} is no whole file, and over a day old: upload it again")
+    if not found.clouds and not found.own:
+        return _without_cloud(name, group[0], found)
+    arrival = _whole(name, _config(name, group[0], found, estate), found.own, estate, now)
+    return arrival._replace(passed=tuple(passed))
+
+
+def _config(name: str, path: Path, found: _Found, estate: EstateConfig) -> SurveyConfig:
+    """What holds for a survey with the files that were found."""
+    config = estate.of_survey(name, found.own, cloud=_several(found.clouds), boundaries=_only(found.polygons))
+    if len(found.polygons) > 1 and not config.boundaries:
+        raise InputError(
+            f"{path}: holds {len(found.polygons)} files of polygons: name one in its {paths.OWN_CONFIGURATION}, "
+            "as 'boundaries: FILE'"
+        )
     if not config.cloud:
         raise InputError(f"{path}: holds no cloud, and its {paths.OWN_CONFIGURATION} names none")
-    used = [p for p in (config.cloud, config.boundaries, own) if p]
+    return config
+
+
+def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConfig, now: float) -> Arrival:
+    """A survey, if its files have stayed as they are, and are there to their ends."""
+    clouds = cloud_files(config.cloud or ())
+    used = [p for p in (*clouds, config.boundaries, own) if p]
     for file in used:
         _check(file)
     age = now - max(p.stat().st_mtime for p in used)
     if 0 <= age < estate.settle:
         return Arrival(name, None, f"changed {age:.0f} s ago, waits until {estate.settle:.0f} s", waits=True)
-    if lacks := unfinished(config.cloud):
-        return Arrival(name, None, f"{config.cloud}: {lacks}: is its upload over?", waits=age < LATE)
+    for cloud in clouds:
+        if lacks := unfinished(cloud):
+            return Arrival(name, None, f"{cloud}: {lacks}: is its upload over?", waits=age < LATE)
     return Arrival(name, config)
+
+
+def _found(files: Iterable[Path], folder: Path | None) -> _Found:
+    """What is what among the files of a survey."""
+    shown = sorted(p for p in files if not p.name.startswith(".") and (p.is_file() or not folder))
+    polygons = [p for p in shown if _has_polygons(p)] if folder else []
+    if len(polygons) > 1:
+        polygons = [p for p in polygons if p.stem.lower() in USUAL] or polygons
+    own = folder / paths.OWN_CONFIGURATION if folder and (folder / paths.OWN_CONFIGURATION).is_file() else None
+    unusable = {p: why for p in shown if (why := _unusable(p))}
+    partial = [p for p in shown if p.suffix.lower() in PARTIAL]
+    clouds = once([p for p in shown if p.suffix.lower() in CLOUDS])
+    deeper = _deeper(folder, DEEP[:1] if clouds else DEEP) if folder and not own else []
+    return _Found(clouds, polygons, own, unusable, partial, deeper)
+
+
+def _deeper(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """Folders in a folder that hold clouds."""
+    clouds = (path for pattern in patterns for path in folder.glob(pattern) if is_cloud(path))
+    shown = (path.parent for path in clouds if not any(p.startswith(".") for p in path.relative_to(folder).parts))
+    return list(dict.fromkeys(shown))
+
+
+def _without_cloud(name: str, path: Path, found: _Found) -> Arrival | None:
+    """What is said of something in which there is no cloud; None where none seems to be meant."""
+    if found.deeper:
+        sub = found.deeper[0].relative_to(path)
+        known = f"move them up, or say 'cloud: {sub}' in its {paths.OWN_CONFIGURATION}"
+        return Arrival(name, None, f"{path}: its clouds lie in {sub}: {known}")
+    if found.unusable:
+        first, *others = (f"{file} {why}" for file, why in found.unusable.items())
+        return Arrival(name, None, first, passed=tuple(others))
+    if found.polygons:
+        return Arrival(name, None, f"{path}: holds polygons, but no cloud: put LAS or LAZ there", waits=True)
+    return None
+
+
+def _has_polygons(path: Path) -> bool:
+    """Whether a file is one of polygons, by its name, or by what is in it where many things have such a name."""
+    kind = path.suffix.lower()
+    if kind == ".zip":
+        return bool(polygons_in(path))
+    if kind == ".json":
+        with path.open("rb") as stream:
+            return FEATURES in stream.read(BEGINNING)
+    return kind in POLYGONS
+
+
+def _unusable(path: Path) -> str | None:
+    """What to do with a file that can't be read, but may be meant to be."""
+    kind = path.suffix.lower()
+    what = next((why for why, kinds in UNUSABLE.items() if kind in kinds), None)
+    return None if kind == ".zip" and polygons_in(path) else what
 
 
 def _check(file: Path) -> None:
@@ -115,5 +231,9 @@ def _check(file: Path) -> None:
         raise InputError(f"{file}: no such file")
 
 
-def _only(files: list[Path]) -> Path | None:
+def _several(files: Sequence[Path]) -> Path | list[Path] | None:
+    return list(files) if len(files) > 1 else _only(files)
+
+
+def _only(files: Sequence[Path]) -> Path | None:
     return files[0] if len(files) == 1 else None

@@ -14,7 +14,7 @@ from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
 from vinemap.parcel import in_words
-from vinemap.product.recipe import Recipe, Source, flown, product_in, read_source
+from vinemap.product.recipe import Recipe, Source, flown, product_in, read_clouds, read_source
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
@@ -88,15 +88,16 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
     hashed, known = _earlier(folder)
+    clouds = read_clouds(cloud, hashed)
     polygons: dict[str, Parcel | InputError | None]
     crs, listed = parse_crs(config.crs) if config.crs else None, config.parcels is not None
     sources: tuple[Source, ...]
     if config.boundaries is None and config.parcels is None and not boundaries.exists():
-        sources, polygons = (read_source(cloud, hashed),), {config.survey: None}
+        sources, polygons = clouds, {config.survey: None}
     else:
-        sources = read_source(cloud, hashed), read_source(boundaries, hashed)
+        sources = *clouds, read_source(boundaries, hashed)
         polygons = {**read_parcels(boundaries, config.parcels, local=crs is not None and is_local(crs))}
-    date = flown(sources[0])
+    files, date = tuple(source.path for source in clouds), min(map(flown, clouds))
     plan = Plan(sources, date, [], [], listed)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
@@ -118,7 +119,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             continue
         own = config.of_parcel(parcel)
         boundary, remarks = polygon or (None, ())
-        made_of = parcel, cloud, sources, boundary, own.settings, crs, own.origin, date, config.survey, remarks
+        made_of = parcel, files, sources, boundary, own.settings, crs, own.origin, date, config.survey, remarks
         recipe = Recipe(*made_of)
         key = recipe.key
         product = None if again else product_in(place)

@@ -13,6 +13,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import paths
+from vinemap.cloud.files import worded
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
@@ -185,16 +186,16 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
             yield recipe, None
     if not together:
         return
-    cloud, limit = together[0].cloud, config.job.limit * len(together)
+    clouds, limit = together[0].clouds, config.job.limit * len(together)
     reader = Worker(cores=machine.cores(), memory=_memory(config.job, 1))
     try:
         boundaries = [recipe.boundary for recipe in together]
-        pieces = reader.run(_split, cloud, boundaries, aside, crs=together[0].crs, limit=limit)
+        pieces = reader.run(_split, clouds, boundaries, aside, crs=together[0].crs, limit=limit)
     except WorkerError as error:
-        raise WorkerError(f"{cloud}: can't be read: {error}") from error
+        raise WorkerError(f"{worded(clouds)}: can't be read: {error}") from error
     finally:
         reader.close()
-    plan.sources[0].check()
+    together[0].check()
     sizes = [0 if isinstance(piece, InputError) else piece.path.stat().st_size for piece in pieces]
     for k in sorted(range(len(pieces)), key=lambda k: -sizes[k]):
         recipe, piece = together[k], pieces[k]
@@ -211,9 +212,11 @@ def _is_dealt(recipe: Recipe) -> bool:
     return recipe.boundary is not None and recipe.settings.ground.engine != "pdal"
 
 
-def _split(cloud: Path, boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None) -> list[Piece | InputError]:
+def _split(
+    clouds: Sequence[Path], boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None
+) -> list[Piece | InputError]:
     try:
-        return split_cloud(cloud, boundaries, aside, crs=crs)
+        return split_cloud(clouds, boundaries, aside, crs=crs)
     except OSError as error:
         raise unwritable(aside.parent, error) from error
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import shapely
 
 from vinemap import __version__, paths
-from vinemap.cloud.files import date_of
+from vinemap.cloud.files import cloud_files, date_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import read_parcel
 from vinemap.geo.crs import is_local
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from pyproj import CRS
@@ -114,9 +114,9 @@ class Recipe(NamedTuple):
     """All that the product of a parcel depends on."""
 
     parcel: str
-    cloud: Path
+    clouds: tuple[Path, ...]
     sources: tuple[Source, ...]
-    """The cloud first."""
+    """The clouds first."""
     boundary: Boundary | None
     settings: Settings
     crs: CRS | None
@@ -130,6 +130,11 @@ class Recipe(NamedTuple):
     remarks: tuple[str, ...] = ()
     """What is to be known of the boundary: a sentence each."""
 
+    def check(self) -> None:
+        """Make sure that the clouds are still the same; BusyError if they aren't."""
+        for source in self.sources[: len(self.clouds)]:
+            source.check()
+
     @property
     def key(self) -> str:
         """Hash of what it depends on, this version of vinemap included."""
@@ -140,7 +145,7 @@ class Recipe(NamedTuple):
         parts = {
             "vinemap": __version__,
             "parcel": self.parcel,
-            "cloud": self.sources[0].sha256,
+            "cloud": [source.sha256 for source in self.sources[: len(self.clouds)]],
             "polygon": polygon,
             "crs": self.crs.to_string() if self.crs else None,
             "origin": self.origin,
@@ -150,8 +155,26 @@ class Recipe(NamedTuple):
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
+def read_clouds(clouds: Path | Sequence[Path], known: Iterable[Source] = ()) -> tuple[Source, ...]:
+    """Work out the SHA-256 of a cloud's files; of those with the same content the first counts.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one can't be read.
+    BusyError
+        If one changes meanwhile.
+    """
+    known = list(known)
+    found: dict[str, Source] = {}
+    for path in cloud_files(clouds):
+        source = read_source(path, known)
+        found.setdefault(source.sha256, source)
+    return tuple(found.values())
+
+
 def recipe_of(
-    cloud: Path,
+    clouds: Path | Sequence[Path],
     *,
     parcel: str,
     named: bool = True,
@@ -176,10 +199,10 @@ def recipe_of(
     local = crs is not None and is_local(crs)
     found = read_parcel(boundary, parcel=parcel if named else None, local=local) if boundary else None
     polygon, remarks = found or (None, ())
-    sources = tuple(read_source(path) for path in (cloud, boundary) if path)
-    return Recipe(
-        parcel, cloud, sources, polygon, settings or Settings(), crs, origin, flown(sources[0]), survey, remarks
-    )
+    sources = read_clouds(clouds)
+    files, date = tuple(source.path for source in sources), min(map(flown, sources))
+    sources += (read_source(boundary),) if boundary else ()
+    return Recipe(parcel, files, sources, polygon, settings or Settings(), crs, origin, date, survey, remarks)
 
 
 def flown(cloud: Source) -> datetime:

@@ -23,6 +23,7 @@ from pystac.extensions.file import FileExtension
 from pystac.extensions.projection import ProjectionExtension
 
 from vinemap import __version__, paths
+from vinemap.cloud.files import CLOUDS
 from vinemap.evaluate.unmapped import TALL
 from vinemap.geo.crs import WGS84, is_local, project
 from vinemap.product.store import write_whole
@@ -187,7 +188,7 @@ def write_collection(
     flown : datetime
         When it was flown, with a time zone.
     sources : sequence of (Path, mapping)
-        Cloud, and boundaries if there are any, each with its size in ``bytes`` and its ``sha256``.
+        Clouds, and boundaries if there are any, each with its size in ``bytes`` and its ``sha256``.
 
     Returns
     -------
@@ -213,7 +214,10 @@ def write_collection(
     extent = json.loads(shapely.to_geojson(shapely.box(*bbox)))
     item = pystac.Item(survey, extent, bbox, flown, {"title": f"Survey {survey}"})
     _collect(item, survey, _href(whole, folder))
-    for key, (path, known) in zip(("cloud", "boundaries"), sources, strict=False):
+    clouds = [path for path, _ in sources if path.suffix.lower() in CLOUDS]
+    for path, known in sources:
+        at = clouds.index(path) if path in clouds else -1
+        key = "boundaries" if at < 0 else f"cloud_{at + 1}" if at else "cloud"
         item.add_asset(key, _asset(path, folder, path.name))
         about = FileExtension.ext(item.assets[key], add_if_missing=True)
         about.apply(checksum=SHA256 + known["sha256"], size=known["bytes"])

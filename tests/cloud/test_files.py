@@ -1,0 +1,112 @@
+"""Clouds in many files: tiles and flights read as one, each of them once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import shapely
+from pyproj import CRS, Transformer
+
+from vinemap import paths
+from vinemap.cloud.files import cloud_files
+from vinemap.cloud.las import read_cloud
+from vinemap.cloud.pieces import read_piece, split_cloud
+from vinemap.cloud.tiles import Collector
+from vinemap.errors import InputError
+from vinemap.product.recipe import recipe_of
+
+UTM = CRS.from_epsg(32632)
+
+
+@dataclass
+class Survey:
+    """Points (n, 3), and files of those with an x below and above the middle."""
+
+    points: np.ndarray
+    tiles: list[Path]
+
+
+def write(path, xyz, crs=UTM):
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
+    header.add_crs(crs)
+    las = laspy.LasData(header)
+    las.xyz = xyz
+    las.write(path)
+    return path
+
+
+@pytest.fixture
+def survey(tmp_path):
+    points = np.random.default_rng(0).uniform([414700, 4940700, 460], [414760, 4940750, 470], (5000, 3)).round(3)
+    west = points[:, 0] < 414730
+    (tmp_path / "tiles").mkdir()
+    parts = [write(tmp_path / "tiles" / f"{k}.laz", points[west == k]) for k in (1, 0)]
+    return Survey(points, sorted(parts))
+
+
+def in_order(xyz):
+    return xyz[np.lexsort(xyz.T)]
+
+
+def test_tiles_are_read_as_one(survey, tmp_path):
+    whole = read_cloud(write(tmp_path / "whole.laz", survey.points))
+    cloud = read_cloud(survey.tiles)
+    assert np.allclose(in_order(cloud.xyz), in_order(whole.xyz), atol=1e-6)
+    square = shapely.box(414720, 4940710, 414750, 4940740), UTM
+    (piece,) = split_cloud(survey.tiles, [square], tmp_path)
+    assert np.array_equal(read_piece(piece, Collector()).xyz, read_cloud(survey.tiles, boundary=square).xyz)
+    assert piece.clouds == tuple(survey.tiles)
+
+
+def test_flights_in_other_crss_come_to_the_first_ones(survey):
+    west = survey.points[survey.points[:, 0] < 414730]
+    x, y = Transformer.from_crs(UTM, 3857, always_xy=True).transform(*west[:, :2].T)
+    write(survey.tiles[1], np.column_stack([x, y, west[:, 2]]), CRS.from_epsg(3857))
+    cloud = read_cloud(survey.tiles)
+    assert cloud.crs == UTM
+    assert np.allclose(in_order(cloud.xyz.round(2)), in_order(survey.points.round(2)), atol=0.02)
+
+
+def test_flights_above_other_datums_are_refused(survey):
+    write(survey.tiles[1], survey.points, CRS.from_user_input("EPSG:32632+5773"))
+    said = r"1\.laz: its heights are above EGM96 height, those of 0\.laz above none: say with --crs EPSG:n\+m"
+    with pytest.raises(InputError, match=said):
+        read_cloud(survey.tiles)
+    assert read_cloud(survey.tiles, crs=CRS.from_user_input("EPSG:32632+5773")).vertical == "EGM96 height"
+
+
+def test_one_bad_file_is_named(survey):
+    survey.tiles[1].write_bytes(b"no cloud" * 100)
+    with pytest.raises(InputError, match=r"1\.laz: can't be read as LAS or LAZ"):
+        read_cloud(survey.tiles)
+
+
+def test_folders_and_files(survey, tmp_path):
+    folder = survey.tiles[0].parent
+    assert cloud_files(folder) == tuple(survey.tiles)
+    assert cloud_files([folder, tmp_path / "other.laz"]) == (*survey.tiles, tmp_path / "other.laz")
+    assert paths.named_by(survey.tiles) == "tiles"
+    assert paths.named_by(survey.tiles[:1]) == "0"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="empty: holds no LAS, LAZ or COPC file"):
+        cloud_files(tmp_path / "empty")
+    with pytest.raises(InputError, match="there is no cloud"):
+        cloud_files([])
+
+
+def test_each_cloud_counts_once(survey):
+    first = survey.tiles[0]
+    twin = first.with_name("0.copc.laz")
+    twin.write_bytes(first.read_bytes())
+    assert cloud_files(first.parent) == (twin, survey.tiles[1])
+    first.with_name("0 (copy).laz").write_bytes(first.read_bytes())
+    recipe = recipe_of(first.parent, parcel="A")
+    assert recipe.clouds == (first.with_name("0 (copy).laz"), survey.tiles[1])
+    assert [source.path for source in recipe.sources] == list(recipe.clouds)
+    assert recipe.key != recipe_of(first, parcel="A").key
+    write(twin, survey.points)
+    with pytest.raises(InputError, match="hold another number of points: keep the one that is right"):
+        cloud_files(first.parent)
