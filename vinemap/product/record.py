@@ -12,6 +12,7 @@ from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
 from vinemap.geo.place import doubts_of
 from vinemap.product.notices import height_notices, notices
+from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -45,7 +46,7 @@ def record_of(
     recipe : Recipe
         What the product was made of.
     points : PointCloud or TiledCloud
-        The points that were read.
+        The points with their heights above ground.
     layers : dict of GeoDataFrame
         Those of the GeoPackage.
     chm : Raster
@@ -77,11 +78,20 @@ def record_of(
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
         "warnings": _places(recipe, points)
+        + _flights(points)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + height_notices(layers["rows"], chm)
         + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }
+
+
+def _flights(points: Cloud) -> list[str]:
+    """Whether flights disagree in height, by how much and where."""
+    if (found := disagreement(points)) is None:
+        return []
+    metres, share = found
+    return [f"two flights disagree by {metres:.2f} m in height on {share:.0%} of the ground: align them, or take one"]
 
 
 def _places(recipe: Recipe, points: Cloud) -> list[str]:
