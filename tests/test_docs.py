@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from messages import messages, said
 
 from vinemap.cli.main import commands
 from vinemap.config.drives import load_camera, load_drives
@@ -65,6 +66,29 @@ def test_the_camera_of_the_docs_is_one(tmp_path):
 
 def test_every_key_is_described():
     assert f"```yaml\n{template('survey')}```" in text("configuration.md"), "vinemap config survey has changed"
+
+
+def test_every_message_is_explained():
+    """With … where a value stands; what the page tells of, the software says."""
+    cells = [line.split(" | ") for line in text("messages.md").splitlines() if line.startswith("| `")]
+    listed = [message for cell, *_ in cells for message in re.findall(r"`([^`]+)`", cell)]
+    assert {message: file for message, file in messages().items() if message not in listed} == {}
+    assert sorted(set(listed) - set(messages())) == []
+    assert [cell for cell in cells if len(cell) != 3 or not all(part.strip(" |") for part in cell)] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ('raise InputError(f"{path}: holds {n} things")', ["…: holds … things"]),
+        ('raise OutsideError("nothing " "there")', ["nothing there"]),
+        ('raise Flaw("ends too early")\nx = "as high as {height_m:.0f} m"', ["ends too early", "as high as … m"]),
+        ('raise InputError(reason)\nx = "five words are a remark"', ["five words are a remark"]),
+        ('"""A docstring of five words."""\nx = "no remark"\ny = f"{a}: {b}"', []),
+    ],
+)
+def test_messages_are_found_in_a_source(source, found):
+    assert list(said(source, sentences=True)) == found
 
 
 def test_every_room_is_on_the_map():

@@ -52,7 +52,7 @@ def test_a_place_that_lacks_its_grid(code, lon, lat, grid):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"), [("EPSG:3003", "good to 4 m only"), ("+proj=utm +zone=32 +ellps=intl", "of unk")]
+    ("text", "told"), [("EPSG:3003", "good to 4 m only"), ("+proj=utm +zone=32 +ellps=intl", "is not known: PROJ")]
 )
 def test_a_place_that_is_known_roughly(text, told):
     crs = parse_crs(text)

@@ -31,7 +31,6 @@ WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
 OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
 OF_KML |= {"draworder", "icon", "snippet"}
 """Columns of every KML, which name nothing."""
-FORMATS = "GeoPackage, GeoJSON, KML, KMZ or Shapefile"
 ZIPPED = (".shp", ".gpkg", ".geojson", ".kml")
 """Files of polygons in a ``.zip``."""
 MOST_NAMED = 5
@@ -220,7 +219,7 @@ def _read_table(path: Path, *, local: bool = False) -> _Table:
         raise
     except Exception as error:  # GDAL's errors come in several classes
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: can't be read as {FORMATS} ({reason})") from error
+        raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON, KML, KMZ or Shapefile ({reason})") from error
     if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
         frame = frame.set_crs(LOCAL, allow_override=True)
     if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:

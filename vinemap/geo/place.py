@@ -78,9 +78,11 @@ def check_place(crs: CRS, x: float, y: float, of: str) -> None:
         }
         right = (way for way, other in ways.items() if _holds(area, *_lon_lat(flat, *other), margin=0.0))
         reason = next(right, "perhaps they are swapped, negated, local or in another unit")
-        reason += ": give their CRS with --crs"
-    where = f"{area.west:g} to {area.east:g}° E, {area.south:g} to {area.north:g}° N"
-    raise InputError(f"{of}: coordinates ({x:.2f}, {y:.2f}) lie outside the area of {_called(flat)}, {where}: {reason}")
+        reason = f"{reason}: give their CRS with --crs"
+    raise InputError(
+        f"{of}: coordinates ({x:.2f}, {y:.2f}) lie outside the area of {_called(flat)}, "
+        f"{area.west:g} to {area.east:g}° E, {area.south:g} to {area.north:g}° N: {reason}"
+    )
 
 
 def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
@@ -101,7 +103,9 @@ def _roughness(flat: CRS, x: float, y: float) -> list[str]:
         near = AreaOfInterest(lon, lat, lon, lat)
         group = TransformerGroup(flat, WGS84, always_xy=True, area_of_interest=near)
     metres = _accuracy(flat, x, y)
-    known = "positions in WGS 84 are " + (f"good to {metres:g} m only" if metres >= 0 else "of unknown accuracy")
+    known = "the accuracy of positions in WGS 84 is not known"
+    if metres >= 0:
+        known = f"positions in WGS 84 are good to {metres:g} m only"
     if not group.best_available and group.unavailable_operations:
         best = group.unavailable_operations[0]
         names = ", ".join(grid.short_name for grid in best.grids if not grid.available)

@@ -78,8 +78,11 @@ def notices(
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:
     """That heights, widths and volumes of rows aren't to be trusted, whose canopies weren't seen well."""
     doubtful = int((rows["canopy_confidence"] < SURE).sum())
-    what = f"heights, widths and volumes of {doubtful} of {len(rows)} rows are doubtful: their canopies were seen too"
-    return [f"{what} sparsely or unevenly (canopy_confidence below {SURE:g})"] if doubtful else []
+    remark = (
+        f"heights, widths and volumes of {doubtful} of {len(rows)} rows are doubtful: their canopies were seen too "
+        f"sparsely or unevenly (canopy_confidence below {SURE:g})"
+    )
+    return [remark] if doubtful else []
 
 
 def _in_no_row(unmapped: gpd.GeoDataFrame) -> list[str]:
