@@ -147,22 +147,25 @@ def examined(xyz: Floats, header: Any, source: CRS, path: Path) -> list[str]:
     InputError
         If they can't be there, or are stored too coarsely.
     """
-    x, y = np.median(xyz[:, :2], axis=0).tolist()
+    sample = xyz[:: max(1, len(xyz) // SAMPLE)]
+    x, y = np.median(sample[:, :2], axis=0).tolist()
     check_place(source, x, y, str(path))
-    check_steps(xyz, header, source, path)
+    check_steps(sample, len(xyz), header, source, path)
     return doubts_of(source, x, y)
 
 
-def check_steps(xyz: Floats, header: Any, crs: CRS, path: Path) -> None:
-    """Make sure that points (n, 3) of a file aren't stored more coarsely than they lie apart.
+def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> None:
+    """Make sure that points of a file aren't stored more coarsely than they lie apart.
 
     The steps are those that the file's scale states, or greater ones that the coordinates show: they may have been
     rounded before, or kept in single precision.
 
     Parameters
     ----------
-    xyz : ndarray (n, 3)
-        Some of the file's points, in their order.
+    sample : ndarray (m, 3)
+        Some of n points of the file, evenly.
+    n : int
+        How many points those are taken from.
     header : laspy.LasHeader
         Of the file.
     crs : CRS
@@ -176,14 +179,12 @@ def check_steps(xyz: Floats, header: Any, crs: CRS, path: Path) -> None:
         If they are.
     """
     flat = horizontal(crs)
-    unit = flat.axis_info[0].unit_conversion_factor
-    metres = (
-        np.array([np.cos(np.radians(np.median(xyz[:, 1]))), 1.0]) * DEGREE if flat.is_geographic else np.full(2, unit)
-    )
-    whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(xyz[:, :2], axis=0)
-    areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, len(xyz)))]
+    metres = np.full(2, flat.axis_info[0].unit_conversion_factor)
+    if flat.is_geographic:
+        metres = DEGREE * np.array([np.cos(np.radians(np.median(sample[:, 1]))), 1.0])
+    whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(sample[:, :2], axis=0)
+    areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
     apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
-    sample = xyz[:: max(1, len(xyz) // SAMPLE)]
     sizes = [*metres, vertical_unit(crs)]
     for axis, column, scale, size in zip("xyz", sample.T, header.scales, sizes, strict=True):
         step = max(float(scale), _step(column))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LEAST = 0.09
 """Metres between layers from which on it matters, less what a measured one may be short of 0.1."""
-SAMPLE = 200_000
+SAMPLE = 120_000
 """Points, about, that are looked at."""
 LOWEST, HIGHEST, BIN = -0.6, 1.2, 0.01
 """Metres above the terrain between which layers are looked for, and of a step."""
