@@ -284,9 +284,9 @@ def follow(
                 write_classified(seen.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
-        shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         about: dict[str, Any] = {"n_key_points": seen.n_key_points, "square": seen.field.square}
         record = record_of(recipe, seen.cloud, layers, seen.chm, origin=main, **about)
+        shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {

@@ -21,7 +21,7 @@ def products(vineyard, tmp_path_factory):
     cloud = write_survey(vineyard, tmp_path_factory.mktemp("survey"))
     folder = tmp_path_factory.mktemp("products")
     for name in ("one", "two"):
-        map_parcel(cloud, folder / name, parcel="Clos & Fils #3", boundary=cloud.parent / "parcels.gpkg")
+        map_parcel(cloud, folder / name, parcel="Clos & Fils #3", named=False, boundary=cloud.parent / "parcels.gpkg")
     return folder / "one", folder / "two"
 
 

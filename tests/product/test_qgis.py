@@ -56,7 +56,7 @@ def open_in_qgis(tmp_path_factory):
 def product(vineyard, tmp_path_factory):
     cloud = write_survey(vineyard, tmp_path_factory.mktemp("survey"))
     folder = tmp_path_factory.mktemp("products") / "first"
-    map_parcel(cloud, folder, parcel="Clos & Fils #3", boundary=cloud.parent / "parcels.gpkg")
+    map_parcel(cloud, folder, parcel="Clos & Fils #3", named=False, boundary=cloud.parent / "parcels.gpkg")
     # Nothing may lead back to where it was made.
     return shutil.move(folder, folder.with_name("moved"))
 

@@ -9,7 +9,7 @@ from vinemap.config.settings import Settings
 from vinemap.surfaces.flights import disagreement
 from vinemap.surfaces.ground import terrain_model
 
-SIDE, DENSITY = 40.0, 60.0
+SIDE, DENSITY = 30.0, 60.0
 SURFACE = Settings().ground.model_dump()
 
 
