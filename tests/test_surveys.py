@@ -167,9 +167,10 @@ def test_no_vines_no_rows(product):
     assert len(rows_of(folder, "nothing")) == 0
     record = json.loads((folder / "run.json").read_text())
     assert record["counts"]["rows"] == 0
-    (warning,) = record["warnings"]
-    assert warning.startswith("no row was found in what stands on ")
-    assert "too tall for vines" in warning
+    why, unit = record["warnings"]
+    assert why.startswith("no row was found in what stands on ")
+    assert "too tall for vines" in why
+    assert unit.endswith("are heights in metres? Their unit is told by --crs EPSG:n+m")
 
 
 def test_terrain(product, shared):
