@@ -322,3 +322,15 @@ def test_no_product(tmp_path):
     assert product_in(tmp_path / "none") is None
     (tmp_path / "A").touch()
     assert product_in(tmp_path / "A") is None
+
+
+def test_a_parcel_that_is_called_as_its_cloud_takes_the_only_polygon_and_says_so(tmp_path):
+    """That is its name by default; another name must be the polygon's, and so must this one where there are several."""
+    cloud = write_las(tmp_path / "north.las")
+    one, two = (write_polygons(tmp_path / f"{len(names)}.gpkg", names) for names in (["n"], ["n", "s"]))
+    made = recipe_of(cloud, parcel="north", boundary=one)
+    assert made.boundary == recipe_of(cloud, parcel="n", boundary=one).boundary
+    assert made.remarks == ("the only polygon of 1.gpkg was taken, though none of its columns says 'north'",)
+    for parcel, boundary in (("south", one), ("north", two)):
+        with pytest.raises(InputError, match=r"has '(south|north)' in a column"):
+            recipe_of(cloud, parcel=parcel, boundary=boundary)

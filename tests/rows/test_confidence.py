@@ -103,12 +103,12 @@ def test_it_does_not_matter_which_end_a_row_starts_at():
 
 
 def test_rows_that_are_hardly_sure_are_none():
-    rows = gpd.GeoDataFrame(
-        {"confidence": [0.9, 0.1, 0.8]}, geometry=[shapely.LineString([(0, k), (9, k)]) for k in range(3)]
-    )
+    lines = [shapely.LineString([(0, k), (9, k)]) for k in range(3)]
+    rows = gpd.GeoDataFrame({"confidence": [0.9, 0.1, 0.8], "block": [1, 2, 3]}, geometry=lines)
     gaps = gpd.GeoDataFrame({"row": [0, 1, 2, 2]}, geometry=list(rows.geometry.iloc[[0, 1, 2, 2]]))
     kept, theirs = believed(rows, gaps)
     assert list(kept["confidence"]) == [0.9, 0.8]
+    assert list(kept["block"]) == [1, 2]
     assert list(theirs["row"]) == [0, 1, 1]
     assert all(line.equals(kept.geometry[row]) for row, line in zip(theirs["row"], theirs.geometry, strict=True))
     none, nothing = believed(rows, gaps, min_confidence=1.0)

@@ -70,7 +70,7 @@ def read_boundary(path: Path, *, parcel: str | None = None) -> Boundary:
     return read_parcel(path, parcel=parcel).boundary
 
 
-def read_parcel(path: Path, *, parcel: str | None = None, local: bool = False) -> Parcel:
+def read_parcel(path: Path, *, parcel: str | None = None, lone: bool = False, local: bool = False) -> Parcel:
     """Read the polygon of a parcel, and what is to be known of it.
 
     Parameters
@@ -80,6 +80,8 @@ def read_parcel(path: Path, *, parcel: str | None = None, local: bool = False) -
     parcel : str, optional
         Name that one of the polygon's columns holds; without a name all polygons count. The column is that of
         :func:`read_parcels`, or the next one that holds the name.
+    lone : bool
+        Whether a file's only polygon is the parcel's even if it has another name, which is told.
     local : bool
         Whether coordinates are local, and need no CRS.
 
@@ -88,12 +90,12 @@ def read_parcel(path: Path, *, parcel: str | None = None, local: bool = False) -
     InputError
         If the file can't be read, has no polygon or no CRS, or none with the parcel's name.
     """
+    table = _read_table(path, local=local)
     if parcel is not None:
-        (found,) = read_parcels(path, [parcel], local=local).values()
+        found = _found(table, parcel, path, lone=lone)
         if isinstance(found, InputError):
             raise found
         return found
-    table = _read_table(path, local=local)
     made = _parcel(table, np.arange(len(table.frame)), path)
     others = [_described(table, row) for row in np.flatnonzero(~table.area).tolist()]
     if others:
@@ -145,7 +147,7 @@ def read_parcels(
     return found
 
 
-def _found(table: _Table, name: str, path: Path) -> Parcel | InputError:
+def _found(table: _Table, name: str, path: Path, *, lone: bool = False) -> Parcel | InputError:
     """The polygons of a name, or why there are none."""
     word = unicodedata.normalize("NFC", name)
     rows = next((np.flatnonzero(words == word) for words in table.columns.values() if (words == word).any()), None)
@@ -154,6 +156,10 @@ def _found(table: _Table, name: str, path: Path) -> Parcel | InputError:
     if rows is not None:
         return _made(table, rows, path)
     words = sorted({str(word) for column in table.columns.values() for word in column.dropna()})
+    if lone and len(table.frame) == 1:
+        made = _made(table, np.arange(1), path)
+        told = f"the only polygon of {path.name} was taken, though none of its columns says {name!r}"
+        return made if isinstance(made, InputError) else made._replace(remarks=(*made.remarks, told))
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}?" if close else "check the name"
     n = np.count_nonzero(table.area)

@@ -197,8 +197,11 @@ def recipe_of(
         If the cloud or the boundary can't be read.
     """
     local = crs is not None and is_local(crs)
-    found = read_parcel(boundary, parcel=parcel if named else None, local=local) if boundary else None
-    polygon, remarks = found or (None, ())
+    polygon, remarks = None, ()
+    if boundary:
+        # A product's name by default says nothing of a polygon.
+        lone = parcel == paths.named_by(cloud_files(clouds))
+        polygon, remarks = read_parcel(boundary, parcel=parcel if named else None, lone=lone, local=local)
     sources = read_clouds(clouds)
     files, date = tuple(source.path for source in sources), min(map(flown, sources))
     sources += (read_source(boundary),) if boundary else ()

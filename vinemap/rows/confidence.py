@@ -114,17 +114,18 @@ def believed(
     Parameters
     ----------
     rows : GeoDataFrame
-        With ``confidence``.
+        With ``confidence`` and ``block``; blocks that are left are numbered anew, in their order.
     gaps : GeoDataFrame
         With ``row`` (position in rows).
     min_confidence : float
         Confidence of a row.
     """
     held = (rows["confidence"] >= min_confidence).to_numpy(dtype=bool)
-    row = gaps["row"].to_numpy(dtype=np.int64)
-    position = np.cumsum(held) - 1
-    left = gaps[held[row]] if len(gaps) else gaps
-    return rows[held].reset_index(drop=True), left.assign(row=position[row[held[row]]]).reset_index(drop=True)
+    theirs = held[gaps["row"].to_numpy(dtype=np.int64)]
+    rows, gaps = rows[held].reset_index(drop=True), gaps[theirs].reset_index(drop=True)
+    position = (np.cumsum(held) - 1)[gaps["row"].to_numpy(dtype=np.int64)]
+    block = np.unique(rows["block"], return_inverse=True)[1].astype(np.int64) + 1
+    return rows.assign(block=block), gaps.assign(row=position)
 
 
 def _flags(rows: gpd.GeoDataFrame) -> list[str]:

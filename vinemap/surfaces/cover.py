@@ -95,19 +95,25 @@ def canopy_cover(
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
-    everything, body, crown, above = _counts(cloud, grid, metres, (foot, ridge), high)
-    touching = _closed(everything, body + above, resolution, TOUCHING)
+    counts = _counts(cloud, grid, metres, (foot, ridge), high)
+    everything, body, crown, _ = counts
+    k, side = _cells_a_block(resolution), _side(resolution)
+    blocks = [block_sum(layer, k) for layer in counts]
+    touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
     if touching.any():
-        wide = _closed(everything, crown + above, resolution, WIDEST)
-        touching &= ~binary_dilation(wide, _disc(WIDEST, _side(resolution)))
+        touching &= ~binary_dilation(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), _disc(WIDEST, side))
     apart = _apart(touching, body, crown, grid, metres, resolution)
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
-    canopy = np.where(apart.ravel()[cells_in(metres, grid)], crown, body) if apart.any() else body
+    canopy = body
+    if apart.any():
+        canopy = np.where(apart.ravel()[cells_in(metres, grid)], crown, body)
+        blocks[1] = block_sum(canopy, k)
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
     cover /= blurred + np.float32(0.1 * density)
-    cover[_no_vines(everything, canopy, above, resolution)] = 0.0
+    no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side).repeat(k, axis=0).repeat(k, axis=1)
+    cover[no_vines[: grid.ny, : grid.nx]] = 0.0
     return Raster(cover, grid, cloud.crs), levels
 
 
@@ -169,38 +175,38 @@ def _count(
             counts[3, cell] += 1
 
 
-def _closed(everything: Counts, high: Counts, resolution: float, width: float) -> Flags:
-    """Blocks of cells over which canopy is closed across some metres."""
-    k = max(1, round(BLOCK / resolution))
-    total, above = block_sum(everything, k), block_sum(high, k)
+def _closed(total: Values, high: Values, side: float, width: float) -> Flags:
+    """Blocks of cells over which canopy is closed across some metres, from the numbers of their points."""
     if np.median(total[total > 0]) < ENOUGH:
-        closed = _summed(high, resolution) > 0.5 * np.maximum(_summed(everything, resolution), 1)
+        closed = _around(high) > 0.5 * np.maximum(_around(total), 1)
     else:
-        closed = uniform_filter((above > 0.5 * np.maximum(total, 1)).astype(np.float32), 3) > 0.5
-    out: Flags = binary_opening(closed, _disc(width / 2, _side(resolution)))
+        closed = uniform_filter((high > 0.5 * np.maximum(total, 1)).astype(np.float32), 3) > 0.5
+    out: Flags = binary_opening(closed, _disc(width / 2, side))
     return out
 
 
-def _no_vines(everything: Counts, canopy: Counts, above: Counts, resolution: float) -> Flags:
-    """Cells (ny, nx) of objects taller or wider than a row of vines, with half a metre around them."""
-    k = max(1, round(BLOCK / resolution))
-    total, tall = _summed(everything, resolution), _summed(above, resolution)
-    high = binary_opening((tall > 2.5) & (tall > 0.15 * total), np.ones((3, 3)))
-    wide = _closed(everything, canopy + above, resolution, WIDEST)
-    out: Flags = binary_dilation(high | wide, _disc(0.5, _side(resolution)))
-    return out.repeat(k, axis=0).repeat(k, axis=1)[: everything.shape[0], : everything.shape[1]]
-
-
-def _summed(layer: Counts, resolution: float) -> Values:
-    """Counts over 3 x 3 blocks of cells, so that a sparse cloud is judged by more than a point or two."""
-    k = max(1, round(BLOCK / resolution))
-    out: Values = 9 * uniform_filter(block_sum(layer, k), 3)
+def _no_vines(total: Values, canopy: Values, above: Values, side: float) -> Flags:
+    """Blocks of cells of objects taller or wider than a row of vines, with half a metre around them."""
+    tall = _around(above)
+    high = binary_opening((tall > 2.5) & (tall > 0.15 * _around(total)), np.ones((3, 3)))
+    out: Flags = binary_dilation(high | _closed(total, canopy + above, side, WIDEST), _disc(0.5, side))
     return out
+
+
+def _around(blocks: Values) -> Values:
+    """Sums over 3 x 3 blocks, so that a sparse cloud is judged by more than a point or two."""
+    out: Values = 9 * uniform_filter(blocks, 3)
+    return out
+
+
+def _cells_a_block(resolution: float) -> int:
+    """Cells along a block's side."""
+    return max(1, round(BLOCK / resolution))
 
 
 def _side(resolution: float) -> float:
     """Metres of a block of cells."""
-    return max(1, round(BLOCK / resolution)) * resolution
+    return _cells_a_block(resolution) * resolution
 
 
 def _disc(radius: float, cell: float) -> Flags:
