@@ -197,11 +197,9 @@ def recipe_of(
         If the cloud or the boundary can't be read.
     """
     local = crs is not None and is_local(crs)
-    polygon, remarks = None, ()
-    if boundary:
-        # A product's name by default says nothing of a polygon.
-        lone = parcel == paths.named_by(cloud_files(clouds))
-        polygon, remarks = read_parcel(boundary, parcel=parcel if named else None, lone=lone, local=local)
+    # A product's name by default says nothing of a polygon.
+    how = {"lone": parcel == paths.named_by(cloud_files(clouds)), "local": local}
+    polygon, remarks = read_parcel(boundary, parcel=parcel if named else None, **how) if boundary else (None, ())
     sources = read_clouds(clouds)
     files, date = tuple(source.path for source in sources), min(map(flown, sources))
     sources += (read_source(boundary),) if boundary else ()
