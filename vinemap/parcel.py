@@ -33,7 +33,7 @@ from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.product.record import record_of
 from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
-from vinemap.rows.blocks import group_blocks
+from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.clusters import cluster_rows
 from vinemap.rows.confidence import believed, judge_rows
 from vinemap.rows.curves import trace_rows
@@ -162,7 +162,7 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     options["fit"]["high"] = settings.cover.high
     rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
     rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm), gaps, **options["judging"])
-    rows, gaps = count_missing(*number_rows(rows, gaps), **options["missing"])
+    rows, gaps = count_missing(*number_rows(flag_rows(rows), gaps), **options["missing"])
     return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 

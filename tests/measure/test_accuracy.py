@@ -146,6 +146,8 @@ def test_gaps_missed_invented_and_misjudged(survey, perfect):
     line = next(row for row in survey.rows.geometry if row.distance(dead) > 1)
     invented = gpd.GeoDataFrame(geometry=[*gaps, shapely.ops.substring(line, 5, 8)], crs=gaps.crs)
     assert changed(survey, perfect, gaps=invented)["gaps", "precision"] == pytest.approx(2 / 3)
+    one_vine = survey._replace(dead_vines=survey.dead_vines.iloc[:1])
+    assert changed(one_vine, perfect, gaps=perfect.gaps.iloc[:1])["gaps", "precision"] == 1
     shorter = [shapely.ops.substring(gap, 0.2, gap.length - 0.2) for gap in gaps]
     got = changed(survey, perfect, gaps=gpd.GeoDataFrame(geometry=shorter, crs=gaps.crs))
     assert got["gaps", "recall"] == 1

@@ -25,3 +25,12 @@ def test_a_picture_of_it(tmp_path):
     for k, all_ in enumerate((SOME, nothing)):
         draw_trust(all_, tmp_path / f"{k}.png")
         assert (tmp_path / f"{k}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_misses_its_bar_is_marked():
+    """Sure rows of which a fiftieth is wrong, and doubtful ones that are right."""
+    confidence = np.repeat([0.95, 0.3], [50, 2])
+    right = np.arange(52) != 0
+    _, low, _, high = trust_table(Trust(confidence, right, np.empty(0), np.empty(0)))
+    assert low[1] == "2, 100.0!"
+    assert high[1] == "50, 98.0!"

@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.rows.blocks import group_blocks
+from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.confidence import believed, judge_rows
 
 SPACING = 2.5
@@ -29,7 +29,7 @@ def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0
             there = (np.abs(y[:, None] - np.interp(x, xs, ys)) <= w / 2) & (x >= xs[0]) & (x <= xs[-1])
             values[there] = h if tall else 1.0
         rasters.append(Raster(values, grid, rows.crs))
-    return judge_rows(group_blocks(rows), *rasters)
+    return flag_rows(judge_rows(group_blocks(rows), *rasters))
 
 
 def block(n, length=60.0, at=(0, 0)):
@@ -51,7 +51,7 @@ def test_flags():
 
 def test_rows_of_a_block_are_sure():
     assert judged(block(6))["confidence"].min() > 0.9
-    few = judge_rows(judged(block(6)).iloc[:0], None, None)
+    few = flag_rows(judge_rows(judged(block(6)).iloc[:0], None, None))
     assert few.empty
     assert {"confidence", "flags"} <= set(few)
 

@@ -127,7 +127,7 @@ def _away_from_rows(
     grid = chm.grid
     i, j = np.nonzero(chm.values >= LOWEST)
     height = chm.values[i, j]
-    x, y = grid.west + (j + 0.5) * grid.resolution, grid.north - (i + 0.5) * grid.resolution
+    x, y = (centres[k] for centres, k in zip(grid.centres(), (j, i), strict=True))
     free = np.ones(len(x), dtype=bool) if polygon is None else shapely.contains_xy(polygon, x, y)
     out = np.full(grid.shape, np.nan)
     if len(rows) == 0:

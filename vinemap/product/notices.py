@@ -8,7 +8,8 @@ import numpy as np
 import shapely
 
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
-from vinemap.geo.raster import block_sum
+from vinemap.geo.raster import block_sum, cell_of
+from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -26,8 +27,6 @@ SURE = 0.5
 """Confidence of a row that is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
-LOWEST, HIGHEST = 0.45, 3.6
-"""Metres of height from which what stands there is no grass, and up to which it may be vines."""
 STEP = 0.5
 """Metres between the points of rows."""
 TOP = 0.98
@@ -123,23 +122,24 @@ def _reasons(unmapped: gpd.GeoDataFrame) -> str:
     return "; ".join(told)
 
 
-def height_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
-    """Remarks on heights that no vineyard has, as where feet were read as metres; parameters as of :func:`notices`."""
-    known = chm.values[np.isfinite(chm.values)]
+def height_notices(rows: gpd.GeoDataFrame, chm: Raster, *, highest: float = 3.6) -> list[str]:
+    """Remarks on heights that no vineyard has, as where feet were read as metres.
+
+    Parameters are as of :func:`notices`, and the height in metres up to which canopies are looked for.
+    """
     unit = "are heights in metres? Their unit is told by --crs EPSG:n+m"
     if len(rows) == 0:
+        known = chm.values[np.isfinite(chm.values)]
         top = float(np.quantile(known, TOP)) if len(known) else LOWEST
-        if LOWEST <= top <= HIGHEST:
+        if LOWEST <= top <= highest:
             return []
         return [f"what stands there is up to {top:.1f} m high; if that can't be, {unit}"]
     lacking = int(rows["height_m"].isna().sum())
-    grid = chm.grid
-    x, y = shapely.get_coordinates(shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP)).T
-    i, j = ((grid.north - y) / grid.resolution).astype(int), ((x - grid.west) / grid.resolution).astype(int)
-    over = np.mean(chm.values[np.clip(i, 0, grid.ny - 1), np.clip(j, 0, grid.nx - 1)] > HIGHEST)
+    stations = shapely.get_coordinates(shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP))
+    over = np.mean(chm.values.ravel()[cell_of(stations, chm.grid)] > highest)
     remarks = {
         f"{lacking} of {len(rows)} rows have no canopy that could be measured; if many should, {unit}": lacking > 0,
-        f"plants are higher than {HIGHEST:g} m on {over:.0%} of the rows, and measured only so far; {unit}": over
+        f"plants are higher than {highest:g} m on {over:.0%} of the rows, and measured only so far; {unit}": over
         > MUCH,
     }
     return [remark for remark, holds in remarks.items() if holds]

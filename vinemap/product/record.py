@@ -80,7 +80,7 @@ def record_of(
         "warnings": _places(recipe, points)
         + _flights(points)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
-        + height_notices(layers["rows"], chm)
+        + height_notices(layers["rows"], chm, highest=recipe.settings.cover.high)
         + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }

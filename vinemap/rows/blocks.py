@@ -1,4 +1,4 @@
-"""Vineyard blocks: rows that stand together in one direction and at one spacing, and the ground that they take."""
+"""Blocks of rows of one direction and spacing, and what is odd about a row in its block."""
 
 from __future__ import annotations
 
@@ -14,6 +14,16 @@ SAME_SPACING = 1.2
 """Ratio of their spacings."""
 NEIGHBOURS = 1.6
 """Spacings within which rows are neighbours."""
+SLACK = 0.02
+"""Metres to which distances of rows are needed."""
+ODD_SPACING = 1.5
+"""Ratio of a row's distance from its nearest neighbour to the block's, or its inverse, that is odd."""
+SHORT = 0.5
+"""Share of the block's median length below which a row is short."""
+SPARSE = 0.5
+"""Share of its length with canopy below which a row is sparse."""
+BOW = 0.5
+"""Metres by which a row's bow may differ from its neighbours'."""
 
 
 def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
@@ -32,7 +42,7 @@ def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     n = len(rows)
     if n == 0:
         return rows.assign(block=np.empty(0, dtype=np.int64))
-    lines, spacing = shapely.simplify(rows.geometry.to_numpy(), 0.02), rows["spacing_m"].to_numpy()
+    lines, spacing = shapely.simplify(rows.geometry.to_numpy(), SLACK), rows["spacing_m"].to_numpy()
     ends = np.array([shapely.get_coordinates(line)[[0, -1]] for line in lines])
     angle = np.arctan2(*(ends[:, 1] - ends[:, 0]).T[::-1])
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=NEIGHBOURS * spacing)
@@ -69,3 +79,48 @@ def outline_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         polygons.append(shapely.multipolygons(parts))
         blocks.append(block)
     return gpd.GeoDataFrame({"block": np.array(blocks, dtype=np.int64)}, geometry=polygons, crs=rows.crs)
+
+
+def flag_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Give rows ``flags``, what is odd about each, in words separated by commas.
+
+    They are ``spacing`` (its nearest neighbour is half as far again as is usual in the block, or two thirds as far),
+    ``short`` (less than half the block's median length), ``sparse`` (canopy on less than half of it) and ``curved``
+    (its bow differs from its neighbours').
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineString with ``block`` and ``support``.
+    """
+    lines = shapely.force_2d(rows.geometry.to_numpy())
+    length = shapely.length(lines)
+    flags: list[list[str]] = [["sparse"] if share < SPARSE else [] for share in rows["support"]]
+    for _, members in rows.reset_index(drop=True).groupby("block"):
+        index = members.index.to_numpy()
+        if len(index) < 3:
+            continue
+        mine = lines[index]
+        simple = shapely.simplify(mine, SLACK)
+        away = shapely.distance(simple[:, None], simple[None, :])
+        np.fill_diagonal(away, np.inf)
+        nearest = away.min(axis=1)
+        ratio = nearest / np.median(nearest)
+        bow = np.array([_bow(line) for line in mine])
+        beside = np.argsort(away, axis=1)[:, :4]
+        expected = np.median(bow[beside] * (length[index, None] / length[index][beside]) ** 2, axis=1)
+        for k, i in enumerate(index):
+            if not 1 / ODD_SPACING < ratio[k] < ODD_SPACING:
+                flags[i].append("spacing")
+            if length[i] < SHORT * np.median(length[index]):
+                flags[i].append("short")
+            if abs(bow[k] - expected[k]) > BOW:
+                flags[i].append("curved")
+    return rows.assign(flags=[",".join(words) for words in flags])
+
+
+def _bow(line: shapely.LineString) -> float:
+    """Signed distance in metres of a line's middle from its chord, positive to the left."""
+    (ax, ay), (bx, by) = shapely.get_coordinates(line)[[0, -1]]
+    mx, my = shapely.get_coordinates(shapely.line_interpolate_point(line, 0.5, normalized=True))[0]
+    return float(((bx - ax) * (my - ay) - (by - ay) * (mx - ax)) / max(np.hypot(bx - ax, by - ay), 1e-9))

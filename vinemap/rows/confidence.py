@@ -1,4 +1,4 @@
-"""How sure a row is, and what is odd about it."""
+"""How sure a row is."""
 
 from __future__ import annotations
 
@@ -16,16 +16,9 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
 
 SLACK = 0.02
-"""Metres to which distances of rows are needed."""
-ODD_SPACING = 1.5
-"""Ratio of a row's distance from its nearest neighbour to the block's, or its inverse, that is odd."""
-SHORT = 0.5
-"""Share of the block's median length below which a row is short."""
-SPARSE = 0.5
-"""Share of its length with canopy below which a row is sparse."""
-BOW = 0.5
-"""Metres by which a row's bow may differ from its neighbours'."""
-
+"""Metres to which rows' courses are needed."""
+UNUSUAL = 1.5
+"""Ratio of a distance to the usual one, or its inverse, from which a row isn't beside another as it ought to be."""
 STEP = 0.5
 """Metres between the stations at which rows are looked at."""
 REACH = 2.5
@@ -81,16 +74,14 @@ class _Beside(NamedTuple):
 
 
 def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDataFrame:
-    """Give rows a ``confidence`` in 0–1 and ``flags``.
+    """Give rows a ``confidence`` in 0–1.
 
     Confidence is the share of rows like it that are right, as far as a logistic model of seven ingredients tells it,
     each from 0 to 1 (``EVIDENCE`` has their weights): **company**, the share of the length along which another row runs
     beside it at the distance that is usual for both; **whole**, that it doesn't go on beyond its end where others go
     on, nor crosses where those beside it end; **alike**, that its canopy isn't far wider for its height than
     theirs; **claimed**, the share beside which no canopy stands where the next row ought to be; its **support**;
-    its **contrast**; and its **length** in spacings. Flags, separated by commas, are ``spacing`` (its nearest neighbour
-    is half as far again as is usual in the block, or two thirds as far), ``short`` (less than half the block's median
-    length), ``sparse`` (canopy on less than half of it) and ``curved`` (its bow differs from its neighbours').
+    its **contrast**; and its **length** in spacings.
 
     Parameters
     ----------
@@ -103,7 +94,7 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDat
     """
     found = evidence(rows, cover, chm)
     odds = DOUBT + sum((weight * found[name].to_numpy() for name, weight in EVIDENCE.items()), np.zeros(len(rows)))
-    return rows.assign(confidence=1 / (1 + np.exp(-odds)), flags=_flags(rows))
+    return rows.assign(confidence=1 / (1 + np.exp(-odds)))
 
 
 def believed(
@@ -126,41 +117,6 @@ def believed(
     position = (np.cumsum(held) - 1)[gaps["row"].to_numpy(dtype=np.int64)]
     block = np.unique(rows["block"], return_inverse=True)[1].astype(np.int64) + 1
     return rows.assign(block=block), gaps.assign(row=position)
-
-
-def _flags(rows: gpd.GeoDataFrame) -> list[str]:
-    """What is odd about each row, in words separated by commas."""
-    lines = shapely.force_2d(rows.geometry.to_numpy())
-    length = shapely.length(lines)
-    flags: list[list[str]] = [["sparse"] if share < SPARSE else [] for share in rows["support"]]
-    for _, members in rows.reset_index(drop=True).groupby("block"):
-        index = members.index.to_numpy()
-        if len(index) < 3:
-            continue
-        mine = lines[index]
-        simple = shapely.simplify(mine, SLACK)
-        away = shapely.distance(simple[:, None], simple[None, :])
-        np.fill_diagonal(away, np.inf)
-        nearest = away.min(axis=1)
-        ratio = nearest / np.median(nearest)
-        bow = np.array([_bow(line) for line in mine])
-        beside = np.argsort(away, axis=1)[:, :4]
-        expected = np.median(bow[beside] * (length[index, None] / length[index][beside]) ** 2, axis=1)
-        for k, i in enumerate(index):
-            if not 1 / ODD_SPACING < ratio[k] < ODD_SPACING:
-                flags[i].append("spacing")
-            if length[i] < SHORT * np.median(length[index]):
-                flags[i].append("short")
-            if abs(bow[k] - expected[k]) > BOW:
-                flags[i].append("curved")
-    return [",".join(words) for words in flags]
-
-
-def _bow(line: shapely.LineString) -> float:
-    """Signed distance in metres of a line's middle from its chord, positive to the left."""
-    (ax, ay), (bx, by) = shapely.get_coordinates(line)[[0, -1]]
-    mx, my = shapely.get_coordinates(shapely.line_interpolate_point(line, 0.5, normalized=True))[0]
-    return float(((bx - ax) * (my - ay) - (by - ay) * (mx - ax)) / max(np.hypot(bx - ax, by - ay), 1e-9))
 
 
 def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> pd.DataFrame:
@@ -215,14 +171,14 @@ def _beside(at: _Stations, block: Ints, reach: Values) -> _Beside:
         mine = np.flatnonzero(block[at.row] == one)
         wide = float(reach[block == one].max())
         near = cKDTree(at.xy[mine]).sparse_distance_matrix(tree, wide, output_type="ndarray")
-        pairs.append((mine[near["i"]], near["j"]))
-    i, j = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    others = at.row[i] != at.row[j]
-    i, j = i[others], j[others]
-    along, across = _seen_from(at.xy[i], at.tangent[i], at.xy[j])
-    opposite = np.abs(along) <= 0.75 * STEP
-    opposite &= np.abs((at.tangent[i] * at.tangent[j]).sum(axis=1)) > PARALLEL
-    i, j, across = i[opposite], j[opposite], across[opposite]
+        i, j = mine[near["i"]], near["j"]
+        others = at.row[i] != at.row[j]
+        i, j = i[others], j[others]
+        along, across = _seen_from(at.xy[i], at.tangent[i], at.xy[j])
+        opposite = np.abs(along) <= 0.75 * STEP
+        opposite &= np.abs((at.tangent[i] * at.tangent[j]).sum(axis=1)) > PARALLEL
+        pairs.append((i[opposite], j[opposite], across[opposite]))
+    i, j, across = (np.concatenate(column) for column in zip(*pairs, strict=True))
     away, row = np.full((len(at.row), 2), np.inf), np.full((len(at.row), 2), -1)
     for side, sign in enumerate((1, -1)):
         mine = np.flatnonzero(sign * across > 0)
@@ -243,14 +199,14 @@ def _accompanied(at: _Stations, beside: _Beside, usual: Values) -> Flags:
     there = beside.row >= 0
     expected = np.stack([np.repeat(usual[at.row][:, None], 2, axis=1), usual[beside.row]])
     ratio = np.where(there, beside.away, np.nan) / expected
-    out: Flags = ((ratio > 1 / ODD_SPACING) & (ratio < ODD_SPACING)).all(axis=0).any(axis=1)
+    out: Flags = ((ratio > 1 / UNUSUAL) & (ratio < UNUSUAL)).all(axis=0).any(axis=1)
     return out
 
 
 def _crosses(at: _Stations, beside: _Beside, usual: Values) -> Values:
     """How far rows (n,) run on where those beside them end and others begin: 1 on both sides, 0.5 at an edge."""
     k = round(SEAM / STEP)
-    next_ones = np.where(beside.away < ODD_SPACING * usual[at.row][:, None], beside.row, -1)
+    next_ones = np.where(beside.away < UNUSUAL * usual[at.row][:, None], beside.row, -1)
     before, after = next_ones[: -2 * k], next_ones[2 * k :]
     one_row = (at.row[: -2 * k] == at.row[2 * k :])[:, None]
     broken = one_row & (before != after) & (before >= 0) & (after >= 0)
@@ -266,8 +222,8 @@ def _goes_on(at: _Stations, usual: Values) -> Values:
     ends = np.column_stack([at.start[:-1], at.start[1:] - 1]).ravel()
     row = at.row[ends]
     back = round(TANGENT / STEP)
-    inner = np.where(np.arange(len(ends)) % 2, np.maximum(ends - back, at.start[row]), 0)
-    inner = np.where(np.arange(len(ends)) % 2, inner, np.minimum(ends + back, at.start[row + 1] - 1))
+    backwards, forwards = np.maximum(ends - back, at.start[row]), np.minimum(ends + back, at.start[row + 1] - 1)
+    inner = np.where(np.arange(len(ends)) % 2, backwards, forwards)
     xy = at.xy[ends]
     outward = xy - at.xy[inner]
     outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
@@ -340,5 +296,5 @@ def _unclaimed(at: _Stations, beside: _Beside, usual: Values, cover: Raster, nor
     out = np.zeros(len(at.row), dtype=bool)
     for side, sign in enumerate((1, -1)):
         there = np.nan_to_num(sample_across(cover, at.xy, sign * wide, offsets)).max(axis=1)
-        out |= (there > 0.6 * level[at.row]) & ~(beside.away[:, side] < ODD_SPACING * usual[at.row])
+        out |= (there > 0.6 * level[at.row]) & ~(beside.away[:, side] < UNUSUAL * usual[at.row])
     return out

@@ -21,7 +21,7 @@ from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, extend, normals, resample, way_along
-from vinemap.geo.raster import Raster, nearest_cell, sample, sample_across
+from vinemap.geo.raster import Raster, cells_in, nearest_cell, sample, sample_across
 from vinemap.rows.centre_line import CELL, USUAL, centre_line, half_width
 from vinemap.rows.ends import Standing, cut_to_canopy
 
@@ -88,7 +88,7 @@ def fit_rows(
     end_share: float = 0.6,
     min_gap: float = 0.8,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
-    """Standing the rows' curves to the points of their canopies.
+    """Fit the rows' curves to the points of their canopies.
 
     Parameters
     ----------
@@ -100,7 +100,8 @@ def fit_rows(
     cover : Raster
         Canopy cover; where it is zero there are trees or houses, whose points don't count.
     levels : Levels
-        Heights from which points count as canopy: of its ridge for the centre line, of its body for the ends.
+        Heights from which points count as canopy: of its body for the centre line and the ends, of its ridge for the
+        contrast, and for the centre line where canopies don't stand apart whole.
     dtm : Raster
         Terrain, which gives curves their elevation.
     high : float
@@ -172,14 +173,15 @@ def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | Non
 def _unended(fits: dict[int, Standing | None], half: Values) -> dict[int, Values]:
     """Curves of the rows whose canopy may go on where it wasn't looked for, and not into another row."""
     standing = {k: fit for k, fit in fits.items() if fit}
+    rows, tree = list(standing), shapely.STRtree([shapely.LineString(fit.curve) for fit in standing.values()])
     out = {}
     for k, fit in standing.items():
         if not any(fit.goes_on):
             continue
         longer = extend(fit.curve, 2 * MARGIN)
-        ways = [w for w, on in zip((longer[:2], longer[-2:]), fit.goes_on, strict=True) if on]
-        others = [shapely.LineString(other.curve) for j, other in standing.items() if j != k]
-        if not any(shapely.dwithin(shapely.LineString(way), others, half[k]).any() for way in ways):
+        ways = [shapely.LineString(w) for w, on in zip((longer[:2], longer[-2:]), fit.goes_on, strict=True) if on]
+        near = tree.query(ways, predicate="dwithin", distance=half[k])[1]
+        if all(rows[other] == k for other in near):
             out[k] = fit.curve
     return out
 
@@ -202,9 +204,10 @@ def _half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Ras
     """Metres to both sides of courses in which their canopy is looked for: more where it is wide among others."""
     spacing, alone = (courses[name].to_numpy() for name in ("spacing_m", "alone"))
     half: Values = half_width(spacing)
+    anywhere = bool(levels.touching.any())
     for k in np.flatnonzero(~alone).tolist():
         stations, most = curves[k][:: round(1 / CELL)], max(half[k], ABREAST * spacing[k])
-        if (sample(levels.ridge, stations) > sample(levels.body, stations)).any():
+        if anywhere and (sample(levels.ridge, stations) > sample(levels.body, stations)).any():
             half[k] = most
             continue
         aside = np.arange(0.0, spacing[k] / 2, cover.grid.resolution)
@@ -218,14 +221,10 @@ def _half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Ras
 def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags, Grid]:
     """Cells with cover and, where that is of ridges alone, those beside, as canopies are wider below."""
     vines: Flags = cover.values > 0
-    touching = levels.ridge.values > levels.body.values
+    touching = levels.touching
     if touching.any() and len(half):
-        x, y = cover.grid.centres()
-        metres = levels.body.grid
-        i = np.clip((metres.north - y) / metres.resolution, 0, metres.ny - 1).astype(int)
-        j = np.clip((x - metres.west) / metres.resolution, 0, metres.nx - 1).astype(int)
         wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
-        vines |= wider & touching[np.ix_(i, j)]
+        vines |= wider & touching.ravel()[cells_in(levels.body.grid, cover.grid)]
     return vines, cover.grid
 
 
@@ -253,7 +252,7 @@ def _deal(
     high: float,
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
-    touching = bool((levels.ridge.values > levels.body.values).any())
+    touching = bool(levels.touching.any())
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
         def above(level: Raster) -> Values:

@@ -27,6 +27,7 @@ from vinemap.surfaces.statistics import LOWEST, height_about
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.geo.raster import Grid
 
 LOWER, BROADER, LONG = 0.75, 1.65, 2.0
 """Height at the most and width at the least of a strip of a cover crop, in those of the rows on both sides of it, and
@@ -98,7 +99,7 @@ def heights_of_vines(
 def _nets(chm: Raster) -> Values:
     """Height (ny, nx) of what is flat and closed across some metres, 0 elsewhere."""
     cell = chm.grid.resolution
-    height = height_about(chm, np.inf, order=0.5).ravel()[cells_in(coarser(chm.grid, resolution=1.0), chm.grid)]
+    height = _in_cells(height_about(chm, np.inf, order=0.5), chm.grid)
     flat = (height >= LOWEST) & (np.abs(np.nan_to_num(chm.values) - height) <= (1 - FLAT) * height)
     if np.count_nonzero(flat) * cell**2 < CLOSED * WIDE**2:
         return np.zeros(chm.grid.shape)
@@ -110,12 +111,18 @@ def _nets(chm: Raster) -> Values:
     return np.where(flat & (distance_transform_edt(~middle) * cell <= WIDE), height, 0.0)
 
 
+def _in_cells(heights: Values, grid: Grid) -> Values:
+    """What :func:`vinemap.surfaces.statistics.height_about` gives, in the cells (ny, nx) of the height model."""
+    out: Values = heights.ravel()[cells_in(coarser(grid, resolution=1.0), grid)]
+    return out
+
+
 def _cover_crops(chm: Raster, high: float) -> Flags:
     """Cells (ny, nx) of long strips that are lower and broader than the rows on both sides of them.
 
     A row of young vines between old ones is lower, too, but no broader.
     """
-    top = height_about(chm, high).ravel()[cells_in(coarser(chm.grid, resolution=1.0), chm.grid)]
+    top = _in_cells(height_about(chm, high), chm.grid)
     out: Flags = np.zeros(chm.grid.shape, dtype=bool)
     height = np.where(np.isnan(chm.values), maximum_filter(np.nan_to_num(chm.values), 3), chm.values)
     vines = (top >= LOWEST) & (height >= LOWEST) & (height <= high)

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, unif
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
-from vinemap.geo.raster import Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
+from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
 from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Values
-    from vinemap.geo.raster import Grid
 
     Counts = NDArray[np.uint16]
 
@@ -52,6 +51,12 @@ class Levels(NamedTuple):
     """Of canopies whole."""
     ridge: Raster
     """Of what stands apart: the same but where rows touch."""
+
+    @property
+    def touching(self) -> Flags:
+        """Cells where they differ."""
+        out: Flags = self.ridge.values > self.body.values
+        return out
 
 
 def canopy_cover(
@@ -125,9 +130,8 @@ def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Gri
     out = np.zeros(metres.ny * metres.nx, dtype=bool)
     if not touching.any():
         return out.reshape(metres.shape)
-    i, j = np.nonzero(touching)
-    x, y = grid.west + (j + 0.5) * _side(resolution), grid.north - (i + 0.5) * _side(resolution)
-    out[cell_of(np.column_stack([x, y]), metres)] = True
+    blocks = Grid(grid.west, grid.north, _side(resolution), *touching.shape)
+    out[cells_in(metres, blocks)[touching]] = True
     touch = out.reshape(metres.shape)
     near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (BESIDE, ABOUT))
     cells = cells_in(metres, grid).ravel()

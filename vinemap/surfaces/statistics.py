@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from vinemap.cloud.bins import quantiles_in
-from vinemap.geo.raster import Grid, Raster, above, coarser, window
+from vinemap.geo.raster import Grid, Raster, above, cells_in, coarser, window
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
@@ -62,9 +62,6 @@ def height_about(chm: Raster, high: float, *, order: float = TOP) -> Values:
     n = np.isfinite(ordered).sum(axis=2)
     rank = np.maximum(np.ceil(order * n).astype(int) - 1, 0)
     top = np.nan_to_num(np.take_along_axis(ordered, rank[:, :, None], axis=2)[:, :, 0])
-    x, y = coarser(chm.grid, resolution=1.0).centres()
-    side = squares * chm.grid.resolution
-    i = np.minimum(((chm.grid.north - y) / side).astype(int), ny - 1)
-    j = np.minimum(((x - chm.grid.west) / side).astype(int), nx - 1)
-    out: Values = maximum_filter(top, 3)[np.ix_(i, j)]
+    coarse = Grid(chm.grid.west, chm.grid.north, squares * chm.grid.resolution, ny, nx)
+    out: Values = maximum_filter(top, 3).ravel()[cells_in(coarse, coarser(chm.grid, resolution=1.0))]
     return out

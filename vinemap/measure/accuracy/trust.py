@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from vinemap.parcel import RowMap
 
 SURE, DOUBTFUL = 0.9, 0.5
-"""Confidence from which 99% of rows should be right, and below which half of them at the most."""
+"""Confidence of rows that are sure, and below which they are doubtful."""
+MOSTLY, HALF = 0.99, 0.5
+"""Share of the sure ones that must be right, and of the doubtful ones that may be."""
 BINS = np.linspace(0, 1, 11)
 
 
@@ -68,14 +70,14 @@ def pool_trust(maps: Sequence[Trust]) -> Trust:
 def trust_table(all_: Trust) -> list[list[str]]:
     """Lines of a table: how many rows of a confidence are right, and how far off the volume of such canopies is."""
     lines = [["confidence", "rows: all, right %", "canopies: all, volume off % (median, 90%)"]]
-    for name, low, high in (
-        (f"below {DOUBTFUL:g}", 0.0, DOUBTFUL),
-        (f"{DOUBTFUL:g} to {SURE:g}", DOUBTFUL, SURE),
-        (f"{SURE:g} and more", SURE, np.inf),
+    for name, low, high, least, most in (
+        (f"below {DOUBTFUL:g}", 0.0, DOUBTFUL, 0.0, HALF),
+        (f"{DOUBTFUL:g} to {SURE:g}", DOUBTFUL, SURE, 0.0, 1.0),
+        (f"{SURE:g} and more", SURE, np.inf, MOSTLY, 1.0),
     ):
         right = all_.right[(all_.confidence >= low) & (all_.confidence < high)]
         off = np.abs(all_.volume[(all_.canopy >= low) & (all_.canopy < high)])
-        share = f"{100 * right.mean():.1f}" if len(right) else "–"
+        share = f"{100 * right.mean():.1f}{'' if least <= right.mean() <= most else '!'}" if len(right) else "–"
         errors = ", ".join(f"{100 * quantile(off, order):.1f}" for order in (0.5, 0.9)) if len(off) else "–"
         lines.append([name, f"{len(right)}, {share}", f"{len(off)}, {errors}"])
     return lines
