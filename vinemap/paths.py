@@ -46,16 +46,26 @@ def safe(name: str) -> str:
     return f"_{plain}" if not plain or DEVICES.fullmatch(plain) else plain
 
 
+def bare(cloud: Path) -> str:
+    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``)."""
+    return re.sub(r"\.copc$", "", cloud.stem, flags=re.IGNORECASE)
+
+
 def stem(cloud: Path) -> str:
-    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``), fit to name other files."""
-    name = re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", cloud.stem.removesuffix(".copc"))
-    return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ") or "cloud"
+    """That name, fit to name other files."""
+    return _plain(bare(cloud))
+
+
+def _plain(name: str) -> str:
+    """A name without what makes trouble in names of files and on command lines."""
+    kept = re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", name)
+    return kept[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ") or "cloud"
 
 
 def named_by(clouds: Sequence[Path]) -> str:
     """What a survey is called after its files: a single one, or the folder that holds them all."""
     folders = {cloud.resolve().parent for cloud in clouds}
-    return stem(clouds[0] if len(clouds) == 1 or len(folders) > 1 else folders.pop())
+    return stem(clouds[0]) if len(clouds) == 1 or len(folders) > 1 else _plain(folders.pop().name)
 
 
 def configuration(survey: str) -> Path:

@@ -90,6 +90,9 @@ def test_folders_and_files(survey, tmp_path):
     assert cloud_files([folder, tmp_path / "other.laz"]) == (*survey.tiles, tmp_path / "other.laz")
     assert paths.named_by(survey.tiles) == "tiles"
     assert paths.named_by(survey.tiles[:1]) == "0"
+    flights = [tmp_path / "flight 2026.05.12" / name for name in ("a.laz", "b.laz")]
+    assert paths.named_by(flights) == "flight 2026.05.12"
+    assert paths.named_by([tmp_path / "may.5.COPC.laz"]) == "may.5"
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty: holds no LAS, LAZ or COPC file"):
         cloud_files(tmp_path / "empty")

@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vinemap import paths
 from vinemap.cloud.las_end import begins_as_las, read_head
 from vinemap.errors import InputError
 
@@ -64,7 +65,7 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
     """
     best: dict[tuple[Path, str], Path] = {}
     for path in files:
-        key = path.parent, name_of(path)
+        key = path.parent, paths.bare(path)
         other = best.setdefault(key, path)
         if other == path:
             continue
@@ -72,11 +73,6 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
             raise InputError(f"{other} and {path.name} hold another number of points: keep the one that is right")
         best[key] = max(path, other, key=_rank)
     return tuple(best.values())
-
-
-def name_of(path: Path) -> str:
-    """Name of a cloud without what tells its format."""
-    return path.stem.removesuffix(".copc").removesuffix(".COPC")
 
 
 def points_in(path: Path) -> int | None:

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
-from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, name_of, once
+from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
@@ -116,7 +116,7 @@ def _surveys(found: Iterable[Path]) -> Iterator[tuple[str, list[Path]]]:
             continue
         folder = path.is_dir()
         if not folder and path.suffix.lower() in CLOUDS:
-            groups.setdefault((name_of(path), False), []).append(path)
+            groups.setdefault((paths.bare(path), False), []).append(path)
         elif folder or path.suffix.lower() in PARTIAL or _unusable(path):
             groups[path.name, folder] = [path]
     for (name, _), group in groups.items():
