@@ -113,3 +113,7 @@ def test_each_cloud_counts_once(survey):
     write(twin, survey.points)
     with pytest.raises(InputError, match="hold another number of points: keep the one that is right"):
         cloud_files(first.parent)
+    twin.write_bytes(first.read_bytes()[:200])
+    assert twin in cloud_files(first.parent)
+    with pytest.raises(InputError, match=r"0\.copc\.laz: its header isn't whole"):
+        read_cloud(cloud_files(first.parent))

@@ -61,18 +61,17 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
     Raises
     ------
     InputError
-        If they hold another number of points.
+        If they hold another number of points, as far as their headers are whole.
     """
-    best: dict[tuple[Path, str], Path] = {}
-    for path in files:
-        key = path.parent, paths.bare(path)
-        other = best.setdefault(key, path)
-        if other == path:
-            continue
-        if points_in(path) != points_in(other):
-            raise InputError(f"{other} and {path.name} hold another number of points: keep the one that is right")
-        best[key] = max(path, other, key=_rank)
-    return tuple(best.values())
+    groups: dict[tuple[Path, str], list[Path]] = {}
+    for path in dict.fromkeys(files):
+        groups.setdefault((path.parent, paths.bare(path)), []).append(path)
+    for group in groups.values():
+        counts = {path: points_in(path) for path in group} if len(group) > 1 else {}
+        known = [path for path, n in counts.items() if n is not None]
+        if other := next((path for path in known if counts[path] != counts[known[0]]), None):
+            raise InputError(f"{known[0]} and {other.name} hold another number of points: keep the one that is right")
+    return tuple(max(group, key=_rank) for group in groups.values())
 
 
 def points_in(path: Path) -> int | None:
