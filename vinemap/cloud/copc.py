@@ -126,10 +126,11 @@ def _unpacked(stream: IO[bytes], reader: Any, nodes: list[Any]) -> Any:
 
 def _in_place(points: Any, nodes: list[Any]) -> bool:
     """Whether the points of every node lie where the index has it."""
-    counts = [node.point_count for node in nodes]
-    low, high = (np.repeat([getattr(n.bounds, side) for n in nodes], counts, axis=0) for side in ("mins", "maxs"))
-    for k, xyz in enumerate((points.x, points.y, points.z) if counts else ()):
-        slack = 2 * points.scales[k]
-        if (np.asarray(xyz) < low[:, k] - slack).any() or (np.asarray(xyz) > high[:, k] + slack).any():
+    starts = np.cumsum([0, *(node.point_count for node in nodes[:-1])])
+    low, high = (np.array([getattr(node.bounds, side) for node in nodes]) for side in ("mins", "maxs"))
+    for k, column in enumerate((points.x, points.y, points.z) if nodes else ()):
+        values, slack = np.asarray(column), 2 * points.scales[k]
+        least, most = (ends.reduceat(values, starts) for ends in (np.minimum, np.maximum))
+        if (least < low[:, k] - slack).any() or (most > high[:, k] + slack).any():
             return False
     return True
