@@ -92,7 +92,7 @@ def read_parcel(path: Path, *, parcel: str | None = None, lone: bool = False, lo
     """
     table = _read_table(path, local=local)
     if parcel is not None:
-        found = _found(table, parcel, path, lone=lone)
+        found = _found(table, _places(table), parcel, path, lone=lone)
         if isinstance(found, InputError):
             raise found
         return found
@@ -127,14 +127,13 @@ def read_parcels(
         If the file can't be read, has no polygon or no CRS, or no column that names them.
     """
     table = _read_table(path, local=local)
-    found: dict[str, Parcel | InputError] = {}
     if names is not None:
-        for name in names:
-            found[name] = _found(table, name, path)
-        return found
+        places = _places(table)
+        return {name: _found(table, places, name, path) for name in names}
     if not table.usable:
         n = np.count_nonzero(table.area)
         raise InputError(f"{path}: no column has a name of its own for each of its {n} polygons: add one, 'name'")
+    found: dict[str, Parcel | InputError] = {}
     column, words = next(iter(table.columns.items()))
     for row, word in enumerate(words):
         name = f"polygon {row + 1}" if pd.isna(word) else str(word)
@@ -143,24 +142,31 @@ def read_parcels(
         elif pd.isna(word):
             found[name] = InputError(f"{path}: {name} has no name in column {column!r}: give it one")
         else:
-            found[name] = _made(table, np.flatnonzero(words == word), path)
+            found[name] = _made(table, np.array([row]), path)
     return found
 
 
-def _found(table: _Table, name: str, path: Path, *, lone: bool = False) -> Parcel | InputError:
+def _places(table: _Table) -> list[dict[str, NDArray[np.int_]]]:
+    """The rows of every word of each column."""
+    groups = (words.groupby(words).indices for words in table.columns.values())
+    return [{str(word): np.asarray(rows) for word, rows in group.items()} for group in groups]
+
+
+def _found(
+    table: _Table, places: list[dict[str, NDArray[np.int_]]], name: str, path: Path, *, lone: bool = False
+) -> Parcel | InputError:
     """The polygons of a name, or why there are none."""
     word = unicodedata.normalize("NFC", name)
-    rows = next((np.flatnonzero(words == word) for words in table.columns.values() if (words == word).any()), None)
+    rows = next((rows[word] for rows in places if word in rows), None)
     if rows is None and len(table.frame) == 1 and not _is_named(table, word):
         rows = np.arange(1)
     if rows is not None:
         return _made(table, rows, path)
-    words = sorted({str(word) for column in table.columns.values() for word in column.dropna()})
     if lone and len(table.frame) == 1:
         made = _made(table, np.arange(1), path)
         told = f"the only polygon of {path.name} was taken, though none of its columns says {name!r}"
         return made if isinstance(made, InputError) else made._replace(remarks=(*made.remarks, told))
-    close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name, sorted({word for rows in places for word in rows}), n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}?" if close else "check the name"
     n = np.count_nonzero(table.area)
     return InputError(f"{path}: none of its {n} polygons has {name!r} in a column: {hint}")
