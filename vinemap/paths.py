@@ -203,11 +203,9 @@ def export_folder(folder: Path, parcel: str, kind: str) -> Path:
     return parcel_folder(folder, parcel) / kind
 
 
-def exported(folder: Path, name: str, layer: str, suffix: str) -> Path:
-    """File of an export, of a parcel or a block of one."""
-    parcel, _, block = name.rpartition("_")
-    named = f"{safe(parcel)}_{block}" if block.isdigit() else safe(name)
-    return folder / f"{named}_{layer}{suffix}"
+def exported(folder: Path, parcel: str, layer: str, suffix: str) -> Path:
+    """File of an export of a parcel."""
+    return folder / f"{safe(parcel)}_{layer}{suffix}"
 
 
 def task_data(folder: Path) -> Path:

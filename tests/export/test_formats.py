@@ -419,6 +419,19 @@ def test_rows_of_unknown_width_and_a_single_one_of_unknown_spacing(tmp_path, pro
     assert "C" not in line.attrib
 
 
+@pytest.mark.parametrize(("name", "file"), [("con", "_con"), ("con_1", "con_1"), ("a._1", "a._1")])
+def test_files_of_blocks_are_not_taken_for_parcels(tmp_path, product, name, file):
+    folder = shutil.copytree(product, tmp_path / "product")
+    (folder / f"{NAME}.gpkg").rename(folder / f"{file}.gpkg")
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8")) | {"parcel": name}
+    (folder / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    list(export_products([folder], tmp_path / "out", formats=["geojson", "opennav_coverage"]))
+    written = {path.name for path in (tmp_path / "out" / file).rglob("*.*") if path.name != "run.json"}
+    kinds = [f"{layer}.geojson" for layer in ("rows", "lanes", "row_ends", "gaps", "parcel")]
+    kinds += [f"{block}_{layer}.xml" for block in (1, 2) for layer in ("rows", "lanes")]
+    assert written == {f"{file}_{kind}" for kind in kinds}
+
+
 def test_products_without_rows_or_lanes(tmp_path, product):
     none, one = few(product, tmp_path / "none", 0), few(product, tmp_path / "one", 1)
     out = tmp_path / "out"

@@ -83,13 +83,12 @@ class Field(NamedTuple):
         shapes = shapely.transform(shapely.force_2d(shapes), lambda xy: xy.round(3))
         return frame.set_geometry(gpd.GeoSeries(shapes, index=frame.index))
 
-    def blocks(self) -> Iterator[tuple[str, Field]]:
-        """Each block of rows with a name, for formats that know of one block only."""
+    def blocks(self) -> Iterator[tuple[int | None, Field]]:
+        """Each block of rows with its number, for formats that know of one block only; None if there is one."""
         numbers = sorted(self.rows["block"].unique())
         for block in numbers:
-            name = self.parcel if len(numbers) == 1 else f"{self.parcel}_{block}"
             rows, lanes = (layer[layer["block"] == block] for layer in (self.rows, self.lanes))
-            yield name, self._replace(rows=rows, lanes=lanes)
+            yield int(block) if len(numbers) > 1 else None, self._replace(rows=rows, lanes=lanes)
 
 
 def read_field(product: Path, *, lines: str, headland: float, outer: bool, vertices: int | None = None) -> Field:

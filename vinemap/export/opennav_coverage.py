@@ -56,14 +56,17 @@ def write_opennav_coverage(field: Field, folder: Path, *, frame: str, grid: bool
     """
     polygons = shapely.get_parts(field.plane(field.outline, grid=grid).geometry.to_numpy())
     written = 0
-    for name, block in field.blocks():
-        for kind, layer in (("rows", block.rows), ("lanes", block.lanes)):
+    for block, part in field.blocks():
+        of = "" if block is None else f"{block}_"
+        name = field.parcel if block is None else f"{field.parcel}_{block}"
+        for kind, layer in (("rows", part.rows), ("lanes", part.lanes)):
             if len(layer) < 2:
                 continue
             number = vertices or int(np.ceil(layer.length.max() / STEP)) + 1
             lines = resampled(list(field.plane(layer, grid=grid).geometry), number)
             document = _document(name, polygons, lines, frame)
-            document.write(paths.exported(folder, name, kind, ".xml"), encoding="unicode", xml_declaration=True)
+            path = paths.exported(folder, field.parcel, of + kind, ".xml")
+            document.write(path, encoding="unicode", xml_declaration=True)
             written += 1
     if not written:
         raise InputError(f"{field.parcel}: opennav_coverage wants two rows of a block or more")
