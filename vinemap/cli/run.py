@@ -15,7 +15,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
-@click.option("--boundary", type=FILE, help="Polygon to clip to: GeoPackage, GeoJSON, KML or Shapefile, in any CRS.")
+@click.option(
+    "--boundary",
+    type=FILE,
+    help="Polygon to clip to, in any CRS: GeoPackage, GeoJSON, KML, KMZ or Shapefile, or a .zip of one.",
+)
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--parcel", help="Name of the parcel; the cloud's by default.")
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")

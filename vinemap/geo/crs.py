@@ -226,7 +226,7 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     if metric and not flat.is_bound and axes == {"east", "north"}:
         factors = Proj(flat).get_factors(lon, lat)
         if max(abs(factors.meridional_scale - 1), abs(factors.parallel_scale - 1)) < SCALE_TOLERANCE:
-            kept = Transformer.from_crs(_in_files(flat), WGS84, always_xy=True).transform(x, y)
+            kept = transformer(_in_files(flat), WGS84).transform(x, y)
             if max(abs(kept[0] - lon), abs(kept[1] - lat)) < SAME_DEGREES:
                 return flat
     zone = int((lon + 180) // 6) % 60 + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from pyproj import CRS
@@ -16,7 +16,7 @@ from vinemap.geo.crs import WGS84, code_of, horizontal, is_local, stated, transf
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pyproj._crs import AreaOfUse
+    from pyproj.aoi import AreaOfUse
 
 MARGIN = 1.0
 """Degrees beyond its area of use in which a CRS still serves: next to its zone, in surveys of a whole country."""
@@ -159,9 +159,10 @@ def _area(flat: CRS) -> AreaOfUse | None:
     """Where a CRS is used, stated by itself or known by its code."""
     code = code_of(flat)
     try:
-        return flat.area_of_use or (CRS.from_authority(*code).area_of_use if code else None)
+        area = flat.area_of_use or (CRS.from_authority(*code).area_of_use if code else None)
     except CRSError:
         return None
+    return cast("AreaOfUse | None", area)  # stubs have it in a private module
 
 
 def _lon_lat(flat: CRS, x: float, y: float) -> tuple[float, float]:

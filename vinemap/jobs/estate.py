@@ -180,7 +180,7 @@ def _found(files: Iterable[Path], folder: Path | None) -> _Found:
     own = folder / paths.OWN_CONFIGURATION if folder and (folder / paths.OWN_CONFIGURATION).is_file() else None
     unusable = {p: why for p in shown if (why := _unusable(p))}
     partial = [p for p in shown if p.suffix.lower() in PARTIAL]
-    clouds = once([p for p in shown if p.suffix.lower() in CLOUDS])
+    clouds = once([p for p in shown if is_cloud(p)])
     deeper = _deeper(folder, DEEP[:1] if clouds else DEEP) if folder and not own else []
     return _Found(clouds, polygons, own, unusable, partial, deeper)
 
