@@ -7,6 +7,7 @@ import struct
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 HEADER, OLDEST_HEADER = 375, 227
@@ -46,6 +47,17 @@ class Head(NamedTuple):
         return bool(self.kind & COMPRESSED)
 
 
+class Seen(NamedTuple):
+    """What is seen of a file before its points are read."""
+
+    head: Head | None = None
+    """None if it doesn't begin as LAS, or its header isn't whole."""
+    table: Sequence[tuple[int, int]] = ()
+    """Points and bytes of every chunk of LAZ; where chunks have as many points each, the last is said to have, too."""
+    lacks: str = ""
+    """What it lacks at its end, in words."""
+
+
 def unfinished(cloud: Path) -> str:
     """What a LAS or LAZ file lacks at its end, by its own header; nothing if it lacks nothing.
 
@@ -57,19 +69,24 @@ def unfinished(cloud: Path) -> str:
     OSError
         If the file can't be read.
     """
-    size = cloud.stat().st_size
     with cloud.open("rb") as stream:
-        if not begins_as_las(stream):
-            return ""  # no such file at all, as reading it will tell
-        head = read_head(stream)
-        if head is None:
-            return "its header isn't whole"
-        if not _has_records(stream, head, size):
-            return "ends before the last of its records"
-        if not head.compressed:
-            whole = size >= head.points_at + head.n * head.point_length
-            return "" if whole else f"ends before the last of its {head.n:,} points"
-        return "ends before its table of chunks" if read_chunks(stream, head, size) is None else ""
+        return examine(stream, cloud.stat().st_size).lacks
+
+
+def examine(stream: IO[bytes], size: int) -> Seen:
+    """What a file of a size (bytes) says of its layout, and lacks by that."""
+    if not begins_as_las(stream):
+        return Seen()  # no such file at all, as reading it will tell
+    head = read_head(stream)
+    if head is None:
+        return Seen(lacks="its header isn't whole")
+    if not _has_records(stream, head, size):
+        return Seen(head, lacks="ends before the last of its records")
+    if not head.compressed:
+        whole = size >= head.points_at + head.n * head.point_length
+        return Seen(head, lacks="" if whole else f"ends before the last of its {head.n:,} points")
+    table = _read_chunks(stream, head, size)
+    return Seen(head, lacks="ends before its table of chunks") if table is None else Seen(head, table)
 
 
 def begins_as_las(stream: IO[bytes]) -> bool:
@@ -103,11 +120,10 @@ def _has_records(stream: IO[bytes], head: Head, size: int) -> bool:
     return head.n_late == 0 or at <= size
 
 
-def read_chunks(stream: IO[bytes], head: Head, size: int) -> list[tuple[int, int]] | None:
+def _read_chunks(stream: IO[bytes], head: Head, size: int) -> list[tuple[int, int]] | None:
     """Points and bytes of every chunk of LAZ, by the table of chunks; None if that isn't there to its end.
 
-    Where chunks have as many points each, the last is said to have as many, too. How many chunks there are is checked
-    before the table is read: whoever reads it asks for the memory first.
+    How many chunks there are is checked before the table is read: whoever reads it asks for the memory first.
     """
     import lazrs
 

@@ -15,16 +15,14 @@ from typing import IO, TYPE_CHECKING, NamedTuple
 from vinemap.cloud.las_end import (
     OURS,
     RECORD,
-    begins_as_las,
     chunk_table_at,
+    examine,
     packing_of,
-    read_chunks,
-    read_head,
-    unfinished,
 )
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from vinemap.cloud.las_end import Head
@@ -99,17 +97,16 @@ def read_layout(path: Path) -> Layout:
 
 
 def _read(path: Path) -> Layout:
-    if lacks := unfinished(path):
-        raise Flaw(lacks)
+    size = path.stat().st_size
     with path.open("rb") as stream:
-        if not begins_as_las(stream):
-            raise InputError(f"{path}: can't be read as LAS or LAZ: it doesn't begin as such a file")
-        head, size = read_head(stream), path.stat().st_size
+        head, table, lacks = examine(stream, size)
+        if lacks:
+            raise Flaw(lacks)
         if head is None:
-            raise Flaw("its header isn't whole")
+            raise InputError(f"{path}: can't be read as LAS or LAZ: it doesn't begin as such a file")
         _check_head(stream, head)
         if head.compressed:
-            return _packed(stream, head, size)
+            return _packed(stream, head, size, table)
         _check_count(head, size)
         return Layout(head, [])
 
@@ -146,13 +143,12 @@ def _other_count(head: Head, n: int) -> Flaw:
     return Flaw(f"its header counts {head.n:,} points, but {n:,} are in it")
 
 
-def _packed(stream: IO[bytes], head: Head, size: int) -> Layout:
+def _packed(stream: IO[bytes], head: Head, size: int, table: Sequence[tuple[int, int]]) -> Layout:
     """Layout of LAZ, the lengths and counts of whose chunks must agree with the file's."""
     packing = packing_of(stream, head.points_at)
     way, items = _items(packing, head)
     if way == 1:  # all points in one, as LASzip did at first
         return Layout(head, [])
-    table = read_chunks(stream, head, size) or []
     each = int.from_bytes(packing[12:16], "little")
     lengths = [length for _, length in table]
     starts = list(accumulate(lengths, initial=head.points_at + 8))
