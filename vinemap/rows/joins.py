@@ -50,6 +50,8 @@ class Ends(NamedTuple):
     """Both ends of every piece; ends 2 p and 2 p + 1 are those of piece p."""
 
     xy: Values
+    middle: Values
+    """Middles (2 m, 2) of the piece's last metres."""
     tangent: Values
     """Outward unit vectors (2 m, 2) of the piece's last metres."""
     field: Values
@@ -89,13 +91,13 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
     n = 2 * (len(first) - 1)
-    out = Ends(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
+    out = Ends(*(np.zeros((n, 2)) for _ in range(4)), np.zeros(n), np.full(n, np.nan))
     for p in range(len(first) - 1):
         members = order[first[p] : first[p + 1]]
         s = position[members]
         for end, depth in ((2 * p, s), (2 * p + 1, s[-1] - s)):
             near = members[depth <= TANGENT_LENGTH]
-            middle = xy[near].mean(axis=0)
+            middle = out.middle[end] = xy[near].mean(axis=0)
             half = np.angle(np.exp(2j * direction[near]).sum()) / 2
             outward = xy[members[depth.argmin()]] - middle
             out.field[end] = _like(np.array([np.cos(half), np.sin(half)]), outward)
@@ -115,8 +117,8 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
 def candidates(ends: Ends, max_gap: float) -> Ints:
     """Pairs of ends (k, 2) that may belong together, the best first.
 
-    The lateral mismatch is measured from the tangents of both ends (the mean of the two vanishes on an arc) and
-    from the row field's direction; the smaller counts. It stays below 0.25 m + 5% of the gap and 0.36 spacings.
+    The lateral mismatch is that of the ends from the tangents of both (the mean of the two vanishes on an arc) or that
+    of the middles of their last metres from the row field's direction; the smaller counts. It stays below 0.25 m + 5% of the gap and 0.36 spacings.
     """
     pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
@@ -124,12 +126,12 @@ def candidates(ends: Ends, max_gap: float) -> Ints:
     gap = ends.xy[b] - ends.xy[a]
     length = np.hypot(*gap.T)
 
-    def mismatch(outward: Values) -> Values:
-        turn = outward[a] - outward[b]
-        out: Values = np.abs(turn[:, 0] * gap[:, 1] - turn[:, 1] * gap[:, 0]) / 2
+    def mismatch(at: Values, outward: Values) -> Values:
+        way, turn = at[b] - at[a], outward[a] - outward[b]
+        out: Values = np.abs(turn[:, 0] * way[:, 1] - turn[:, 1] * way[:, 0]) / 2
         return out
 
-    lateral = np.minimum(mismatch(ends.tangent), mismatch(ends.field))
+    lateral = np.minimum(mismatch(ends.xy, ends.tangent), mismatch(ends.middle, ends.field))
     ahead = np.minimum((ends.field[a] * gap).sum(axis=1), -(ends.field[b] * gap).sum(axis=1))
     facing = (ahead >= 0.7 * length - OVERLAP) & ((ends.field[a] * ends.field[b]).sum(axis=1) < -0.7)
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
