@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from vinemap.canopy.points import Sections
-    from vinemap.compute.arrays import Flags, Floats, Ints, Values
+    from vinemap.compute.arrays import Complex, Flags, Floats, Ints, Values
 
     Lofted = tuple[Floats, Ints, tuple["Piece", ...]]
 
@@ -58,13 +59,15 @@ class Audit(NamedTuple):
     """m³; NaN where not watertight."""
 
 
-def loft(polygons: ArrayLike) -> Lofted:
+def loft(polygons: ArrayLike, caps: Sequence[Ints] | None = None) -> Lofted:
     """Join consecutive sections' polygons to a closed piece.
 
     Parameters
     ----------
     polygons : array_like of shape (k, c, 3)
         Corresponding vertices of k sections, k >= 2, all turning the same way.
+    caps : sequence of two arrays of shape (c - 2, 3), optional
+        Triangles of the first polygon and of the last, where they are known.
 
     Returns
     -------
@@ -88,7 +91,8 @@ def loft(polygons: ArrayLike) -> Lofted:
     j = (i + 1) % c
     ring = np.concatenate([np.column_stack([i, j, i + c]), np.column_stack([j, j + c, i + c])])
     sides = (ring + c * np.arange(k - 1)[:, None, None]).reshape(-1, 3)
-    faces = np.concatenate([sides, _cap(sections[0])[:, ::-1], _cap(sections[-1]) + c * (k - 1)])
+    first, last = _caps(sections[[0, -1]]) if caps is None else caps
+    faces = np.concatenate([sides, first[:, ::-1], last + c * (k - 1)])
     vertices = sections.reshape(-1, 3)
     turned = _volume(vertices, faces) < 0
     return vertices, faces[:, ::-1] if turned else faces, (Piece(k, c, turned),)
@@ -117,41 +121,44 @@ def _volume(vertices: Floats, faces: Ints) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def _cap(polygon: Floats) -> Ints:
-    """Triangles (c - 2, 3) of a polygon (c, 3), convex or not, turning as it does (ear clipping)."""
-    spread = polygon - polygon.mean(axis=0)
-    normal = np.cross(spread, np.roll(spread, -1, axis=0)).sum(axis=0)
-    axis = int(np.argmax(np.abs(normal)))
-    u, v = ((axis + 1) % 3, (axis + 2) % 3) if normal[axis] >= 0 else ((axis + 2) % 3, (axis + 1) % 3)
-    flat = [complex(*point) for point in spread[:, [u, v]]]
-    left = list(range(len(flat)))
+def _caps(polygons: Floats) -> Ints:
+    """Triangles (m, c - 2, 3) of polygons (m, c, 3), convex or not, turning as they do (ear clipping)."""
+    spread = polygons - polygons.mean(axis=1, keepdims=True)
+    normal = np.cross(spread, np.roll(spread, -1, axis=1)).sum(axis=1)
+    axis, each = np.abs(normal).argmax(axis=1), np.arange(len(polygons))
+    turn = np.where(normal[each, axis] >= 0, 1, 2)
+    u, v = (spread[each, :, (axis + way) % 3] for way in (turn, -turn))
+    flat, left = u + 1j * v, np.tile(np.arange(polygons.shape[1]), (len(polygons), 1))
     triangles = []
-    while len(left) > 3:
-        corners = [(left[i - 1], left[i], left[(i + 1) % len(left)]) for i in range(len(left))]
+    while left.shape[1] > 3:
+        corners = np.stack([np.roll(left, 1, axis=1), left, np.roll(left, -1, axis=1)], axis=2)
         # Of the ears the fattest; where a crossing or rounding leaves none, the corner nearest to being one.
-        ear = max(corners, key=lambda t: (_is_ear(flat, t, left), _fatness(*(flat[i] for i in t))))
-        triangles.append(ear)
-        left.remove(ear[1])
-    return np.array([*triangles, left], dtype=np.int64)
+        a, b, c = np.moveaxis(flat[each[:, None, None], corners], 2, 0)
+        best = (2 * _ears(a, b, c) + _fatness(a, b, c)).argmax(axis=1)
+        triangles.append(corners[each, best])
+        left = left[np.arange(left.shape[1]) != best[:, None]].reshape(len(left), -1)
+    return np.stack([*triangles, left], axis=1)
 
 
-def _cross(a: complex, b: complex, p: complex) -> float:
-    return ((b - a).conjugate() * (p - a)).imag
+def _cross(a: Complex, b: Complex, p: Complex) -> Floats:
+    out: Floats = ((b - a).conj() * (p - a)).imag
+    return out
 
 
-def _fatness(a: complex, b: complex, c: complex) -> float:
-    """Twice the area over the longest side squared: negative for a reflex corner."""
-    longest = max(abs(a - b), abs(b - c), abs(c - a))
-    return _cross(a, b, c) / longest**2 if longest > 0 else 0.0
+def _fatness(a: Complex, b: Complex, c: Complex) -> Floats:
+    """Twice the area over the longest side squared, below 1: negative for a reflex corner."""
+    longest = np.maximum(np.maximum(abs(a - b), abs(b - c)), abs(c - a))
+    out: Floats = np.divide(_cross(a, b, c), longest**2, out=np.zeros_like(longest), where=longest > 0)
+    return out
 
 
-def _is_ear(flat: Sequence[complex], corner: tuple[int, int, int], others: Sequence[int]) -> bool:
-    """Whether a corner is convex, and its triangle holds no other vertex."""
-    a, b, c = (flat[i] for i in corner)
-    if _cross(a, b, c) <= 0:
-        return False
-    rest = {flat[i] for i in others} - {a, b, c}
-    return not any(min(_cross(a, b, p), _cross(b, c, p), _cross(c, a, p)) >= 0 for p in rest)
+def _ears(a: Complex, b: Complex, c: Complex) -> Flags:
+    """Whether corners (m, n) of polygons with vertices ``b`` are convex, and their triangles hold no other vertex."""
+    p, others = b[:, None], (a[..., None], b[..., None], c[..., None])
+    inside = np.minimum.reduce([_cross(q, r, p) for q, r in pairwise([*others, others[0]])]) >= 0
+    inside &= np.logical_and.reduce([p != corner for corner in others])
+    out: Flags = (_cross(a, b, c) > 0) & ~inside.any(axis=2)
+    return out
 
 
 def audit(mesh: Mesh) -> Audit:
@@ -206,10 +213,11 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
     corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
     breaks = _breaks(canopy.row_id, canopy.position, step)
+    runs = [run for run in np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1) if len(run) > 1]
+    caps = _caps(corners[np.array([run[[0, -1]] for run in runs], dtype=np.int64).ravel()])
     pieces: dict[int, list[Any]] = {}
-    for run in np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1):
-        if len(run) > 1:
-            pieces.setdefault(int(canopy.row_id[run[0]]), []).append(loft(corners[run]))
+    for run, first, last in zip(runs, caps[::2], caps[1::2], strict=True):
+        pieces.setdefault(int(canopy.row_id[run[0]]), []).append(loft(corners[run], (first, last)))
     numbers = rows.drop(columns="geometry").to_dict("records")
     return [
         Mesh(*merge(pieces[row["row_id"]]), row_id=int(row["row_id"]), label=str(row["label"]), extras=row)

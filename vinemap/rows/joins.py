@@ -118,7 +118,8 @@ def candidates(ends: Ends, max_gap: float) -> Ints:
     """Pairs of ends (k, 2) that may belong together, the best first.
 
     The lateral mismatch is that of the ends from the tangents of both (the mean of the two vanishes on an arc) or that
-    of the middles of their last metres from the row field's direction; the smaller counts. It stays below 0.25 m + 5% of the gap and 0.36 spacings.
+    of the middles of their last metres from the row field's direction; the smaller counts. It stays below 0.25 m + 5%
+    of the gap and 0.36 spacings.
     """
     pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
