@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+PLAIN = {int, str, bool, type(None)}
+"""Kinds whose values JSON has as they are."""
+
 
 def jsonable(value: Any) -> Any:
     """A value of Python's own kinds alone: numpy's numbers and arrays as those, what isn't finite as None.
@@ -18,6 +21,8 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, (list, tuple)):
+        if set(map(type, value)) <= PLAIN:
+            return list(value)
         return [jsonable(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None

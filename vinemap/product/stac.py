@@ -49,6 +49,8 @@ MEDIA_TYPES = {
     ".tif": MediaType.COG,
 }
 RESERVED = re.compile(r"[%#?]")
+FOOTPRINT = 0.1
+"""Metres by which the outline in an item may differ from the parcel's."""
 SHA256 = "1220"
 """What a multihash of 32 bytes of SHA-256 begins with."""
 
@@ -130,7 +132,7 @@ def parcel_item(
 
 def _outline(polygon: shapely.Geometry, crs: CRS) -> shapely.Geometry:
     """A polygon in WGS 84: normal is clockwise, RFC 7946 wants the opposite; its eighth decimal is a millimetre."""
-    outline = shapely.reverse(shapely.normalize(project(polygon, crs, WGS84)))
+    outline = shapely.reverse(shapely.normalize(project(shapely.simplify(polygon, FOOTPRINT), crs, WGS84)))
     return shapely.transform(outline, lambda lon_lat: np.round(lon_lat, 8))
 
 

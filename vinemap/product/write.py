@@ -54,6 +54,7 @@ def write_product(
         If one can't be written.
     """
     kinds = dict(zip(RASTERS, (*surfaces, field.direction, field.spacing, field.likelihood), strict=True))
+    layers = {name: conform(layer, name) for name, layer in layers.items()}
     writers: list[Callable[[], None]] = [
         partial(write_geopackage, layers, paths.geopackage(folder, parcel), date=date),
         partial(write_rasters, folder, parcel, kinds),
@@ -86,7 +87,7 @@ def _write_project(
     here = Path()
     document = qgis_project(
         parcel,
-        {name: conform(layer, name) for name, layer in layers.items()},
+        layers,
         rasters,
         geopackage=f"./{paths.geopackage(here, parcel)}",
         tif={kind: f"./{paths.raster(here, parcel, kind)}" for kind in rasters},

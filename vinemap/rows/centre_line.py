@@ -16,10 +16,14 @@ TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""
 SLOPE = 1.0
 """Cutoff of a detail's slopes, in cutoffs of its bends."""
+DETAIL = 0.3
+"""Share of the mean weight that draws a detail to zero in gaps."""
 BACKGROUND, FULL = 0.25, 0.65
 """Shares of a row's cover: what is less isn't its canopy, and what is more counts no more than that."""
 USUAL = 0.8
 """Metres to both sides of a row in which its canopy is looked for, if its spacing leaves as much."""
+SETTLED = 2e-4
+"""Metres by which a centre line moves at the most when it is found."""
 CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 
@@ -50,6 +54,7 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float, 
     excess = np.clip(smooth - BACKGROUND * strength, 0, (FULL - BACKGROUND) * strength)
     centre: Values = np.zeros(len(image))
     for _ in range(4):
+        before = centre
         amount, moment = _centroids(excess, offsets, centre, reach)
         # Stations of a stray leaf or two tell nothing of the row's middle.
         typical = float(np.quantile(amount, 0.7))
@@ -57,13 +62,12 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float, 
         measured = moment / np.maximum(amount, 1e-9)
         robust = np.ones(len(image))
         for _ in range(3):
-            trusted = weight * robust
-            trend = whittaker(measured, trusted, cutoff=TREND * cutoff)
-            # Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
-            centre = trend + whittaker(measured - trend, trusted, cutoff=cutoff, slope=SLOPE * cutoff, ridge=0.3)
+            centre = _smoothed(measured, weight * robust, cutoff)
             residual = np.abs(measured - centre)
             scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
             robust = 1 / (1 + (residual / (2 * scale)) ** 2)
+        if np.abs(centre - before).max() < SETTLED:
+            break
     return centre
 
 
@@ -95,12 +99,25 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 
     course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
     wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
     """
+    return _whittaker(np.asarray(values, dtype=float), np.asarray(weights, dtype=float), cutoff, slope, ridge)
+
+
+@compiled
+def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
+    """Values (n,) as their trend and a detail.
+
+    Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
+    """
+    trend = _whittaker(values, weights, TREND * cutoff, 0.0, 0.0)
+    return trend + _whittaker(values - trend, weights, cutoff, SLOPE * cutoff, DETAIL)
+
+
+@compiled
+def _whittaker(values: Values, weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
     if len(values) < 3:
-        return values
-    bands = _penalties(
-        np.asarray(weights, dtype=float), (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2, max(ridge, 1e-9)
-    )
-    return _solve(bands, np.asarray(weights * values, dtype=float))
+        return values.copy()
+    bands = _penalties(weights, (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2, max(ridge, 1e-9))
+    return _solve(bands, weights * values)
 
 
 @compiled

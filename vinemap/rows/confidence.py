@@ -155,12 +155,9 @@ def _stations(lines: Values) -> _Stations:
     start = np.concatenate([[0], np.cumsum(n)])
     row = np.repeat(np.arange(len(lines)), n)
     share = (np.arange(start[-1]) - start[row]) / (n - 1)[row]
-    here, ahead = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines[row], np.clip(share + s, 0, 1), normalized=True))
-        for s in (-1e-3, 1e-3)
-    )
     xy = shapely.get_coordinates(shapely.line_interpolate_point(lines[row], share, normalized=True))
-    way = ahead - here
+    each = np.arange(start[-1])
+    way = xy[np.minimum(each + 1, start[row + 1] - 1)] - xy[np.maximum(each - 1, start[row])]
     return _Stations(row, xy, way / np.maximum(np.hypot(*way.T), 1e-9)[:, None], start)
 
 

@@ -272,7 +272,8 @@ def _deal(
         for k, row in enumerate(rows):
             mine = slice(near.start[k], near.start[k + 1])
             scale = np.float32((len(curves[row]) - 1) / way_along(curves[row])[-1])
-            columns = (body[mine],) * 2 if ridge is body else (body[mine], ridge[mine])
+            apart = ridge is body or np.array_equal(body[mine], ridge[mine])
+            columns = (body[mine],) * 2 if apart else (body[mine], ridge[mine])
             about = float(half[row]), float(curtains[row])
             shares.append(_Share(curves[row], *about, near.along[mine] * scale, near.left[mine], *columns))
         yield rows, shares

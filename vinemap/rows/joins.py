@@ -91,7 +91,8 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
     order = np.lexsort((position, pieces))
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
     n = 2 * (len(first) - 1)
-    out = Ends(*(np.zeros((n, 2)) for _ in range(4)), np.zeros(n), np.full(n, np.nan))
+    at, middles, tangents, field = np.zeros((4, n, 2))
+    out = Ends(at, middles, tangents, field, np.zeros(n), np.full(n, np.nan))
     for p in range(len(first) - 1):
         members = order[first[p] : first[p + 1]]
         s = position[members]
@@ -110,7 +111,7 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
             if s[-1] >= BEND_LENGTH:
                 offset = xy[members[depth <= BEND_LENGTH]] - middle
                 left = tangent[0] * offset[:, 1] - tangent[1] * offset[:, 0]
-                out.bend[end] = 2 * np.polyfit(offset @ tangent, left, 2)[0]
+                out.bend[end] = 2 * np.linalg.lstsq(np.vander(offset @ tangent, 3), left)[0][0]
     return out
 
 

@@ -22,6 +22,8 @@ WIDE = (1.0, 1.5, 2.0, 3.0)
 """Multiples of the smoothing for canopies that are the wider."""
 WIDTH_SHARE = 0.3
 """Standard deviation of the smoothing, in widths of the canopy."""
+TAIL = 2.5
+"""Standard deviations up to which the smoothing reaches."""
 SLICES = 3
 """Lines across the rows that are averaged in a slice."""
 SOME = 5
@@ -93,10 +95,10 @@ def detect_key_points(
     def maxima(batch: Values) -> Values:
         # Beyond its reach a profile goes on for what the Gaussian needs.
         curtains = float(batch[:, 4].max())
-        margin = 4 * max(WIDE[-1] * smoothing, MERGED * curtains) + bin_width
+        margin = TAIL * max(WIDE[-1] * smoothing, MERGED * curtains) + bin_width
         profile, offsets = _profiles(cover, batch, reach * batch[:, 3].max() + margin, slice_width, bin_width)
         if curtains:
-            profile = gaussian_filter1d(profile, MERGED * curtains / bin_width, axis=1)
+            profile = gaussian_filter1d(profile, MERGED * curtains / bin_width, axis=1, truncate=TAIL)
         else:
             profile = _smoothed(profile, offsets, batch[:, 3], smoothing)
         # What is laid together is spread, too.
@@ -162,13 +164,13 @@ def _smoothed(profile: Values, offsets: Values, spacing: Values, smoothing: floa
     """Profiles (n, bins) smoothed by a Gaussian, the wider the wider the canopy in them: a broad top has one middle."""
     step = offsets[1] - offsets[0]
     inside = np.abs(offsets) <= 0.5 * spacing[:, None]
-    out: Values = gaussian_filter1d(profile, smoothing / step, axis=1)
+    out: Values = gaussian_filter1d(profile, smoothing / step, axis=1, truncate=TAIL)
     highest = np.maximum((out * inside).max(axis=1), 1e-9)
     width = (profile * inside).sum(axis=1) * step / highest
     wanted = np.digitize(WIDTH_SHARE * width / smoothing, [(a + b) / 2 for a, b in pairwise(WIDE)])
     for k, factor in enumerate(WIDE[1:], start=1):
         mine = wanted == k
-        out[mine] = gaussian_filter1d(profile[mine], factor * smoothing / step, axis=1)
+        out[mine] = gaussian_filter1d(profile[mine], factor * smoothing / step, axis=1, truncate=TAIL)
     return out
 
 

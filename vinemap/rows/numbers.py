@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 
 import geopandas as gpd
 import numpy as np
-import pandas as pd
 import shapely
 
 from vinemap.geo.crs import WGS84, Corner, Origin, is_local, to_main, to_wgs84
 
 if TYPE_CHECKING:
+    from pyproj import CRS
+
     from vinemap.compute.arrays import Floats, Ints
 
 
@@ -111,17 +112,17 @@ def describe_rows(
     """
     labels = [f"{i} {parcel}" for i in rows["row_id"]]
     lines = [shapely.get_coordinates(line, include_z=True) for line in rows.geometry]
-    n_points = [max(2, round(_length(xyz) / threshold) + 1) for xyz in lines]
+    n_points = np.array([max(2, round(_length(xyz) / threshold) + 1) for xyz in lines], dtype=np.int64)
     ends = np.array([xyz[[0, -1]] for xyz in lines]).reshape(-1, 3)
     main = to_main(ends, rows.crs, origin).reshape(-1, 2, 3)
     wgs84 = to_wgs84(ends, rows.crs)
     table = {
         "label": labels,
         "length_m": [_length(xyz) for xyz in lines],
-        "orientation_deg": [_orientation(to_main(xyz, rows.crs, origin)) for xyz in lines],
+        "orientation_deg": [_orientation(xyz) for xyz in _in_main(lines, rows.crs, origin)],
         "elevation_m": [_mean_elevation(xyz) for xyz in lines],
         "elevation_diff_m": [float(xyz[-1, 2] - xyz[0, 2]) for xyz in lines],
-        "n_key_points": np.array(n_points, dtype=np.int64),
+        "n_key_points": n_points,
     }
     for e, end in enumerate(("e1", "en")):
         table |= {f"{end}_{axis}": main[:, e, k] for k, axis in enumerate("xyz")}
@@ -139,18 +140,28 @@ def describe_rows(
     return rows.assign(**table), row_ends, _key_points(rows, labels, n_points)
 
 
-def _key_points(rows: gpd.GeoDataFrame, labels: list[str], n_points: list[int]) -> gpd.GeoDataFrame:
-    parts = []
-    for row_id, label, n, line in zip(rows["row_id"], labels, n_points, rows.geometry, strict=True):
-        position = np.linspace(0, line.length, n)
-        points = shapely.line_interpolate_point(line, position)
-        order = np.arange(1, n + 1)
-        parts.append(
-            pd.DataFrame({"row_id": row_id, "label": label, "order": order, "position_m": position, "p": points})
-        )
-    columns = ["row_id", "label", "order", "position_m", "p"]
-    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
-    return gpd.GeoDataFrame(table.drop(columns="p"), geometry=gpd.GeoSeries(list(table["p"])), crs=rows.crs)
+def _key_points(rows: gpd.GeoDataFrame, labels: list[str], n_points: Ints) -> gpd.GeoDataFrame:
+    order = np.arange(n_points.sum()) - np.repeat(np.cumsum(n_points) - n_points, n_points)
+    row = np.repeat(np.arange(len(rows)), n_points)
+    lines = rows.geometry.to_numpy()
+    position = order * (shapely.length(lines) / (n_points - 1))[row]
+    return gpd.GeoDataFrame(
+        {
+            "row_id": rows["row_id"].to_numpy()[row],
+            "label": np.array(labels, dtype=object)[row],
+            "order": order + 1,
+            "position_m": position,
+        },
+        geometry=shapely.line_interpolate_point(lines[row], position),
+        crs=rows.crs,
+    )
+
+
+def _in_main(lines: list[Floats], crs: CRS, origin: Origin | Corner) -> list[Floats]:
+    """Lines (n, 3), as many as there are, in {Main}."""
+    if not lines:
+        return []
+    return np.split(to_main(np.concatenate(lines), crs, origin), np.cumsum([len(xyz) for xyz in lines])[:-1])
 
 
 def _length(xyz: Floats) -> float:

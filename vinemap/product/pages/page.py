@@ -6,7 +6,6 @@ import base64
 import hashlib
 import html
 import json
-import math
 import zlib
 from functools import cache
 from string import Template
@@ -116,7 +115,11 @@ def as_json(data: Any) -> str:
 def whole_numbers(values: ArrayLike, *, unit: float) -> list[int | None]:
     """Values (n,) in whole units, 0.01 for centimetres; None for what isn't finite."""
     counts = np.asarray(values, dtype=float) / unit
-    return [round(value) if math.isfinite(value) else None for value in counts.tolist()]
+    known = np.isfinite(counts)
+    out: list[int | None] = np.rint(np.where(known, counts, 0.0)).astype(np.int64).tolist()
+    for unknown in np.flatnonzero(~known).tolist():
+        out[unknown] = None
+    return out
 
 
 def polylines(lines: ArrayLike, zero: ArrayLike, *, tolerance: float, digits: int = 2) -> list[list[list[float]]]:
