@@ -146,7 +146,9 @@ def _linked(
                     continue
                 x, y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
                 inside = 0
-                for p in (i, j):
+                for k, p in enumerate((i, j)):
+                    if k > inside and least > 1:
+                        break
                     u = x * axis[p, 0] + y * axis[p, 1]
                     v = y * axis[p, 0] - x * axis[p, 1]
                     inside += (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1

@@ -99,10 +99,10 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
         for end, depth in ((2 * p, s), (2 * p + 1, s[-1] - s)):
             near = members[depth <= TANGENT_LENGTH]
             middle = out.middle[end] = xy[near].mean(axis=0)
-            half = np.angle(np.exp(2j * direction[near]).sum()) / 2
+            x, y = (xy[near] - middle).T
             outward = xy[members[depth.argmin()]] - middle
-            out.field[end] = _like(np.array([np.cos(half), np.sin(half)]), outward)
-            axis = np.linalg.svd(xy[near] - middle, full_matrices=False)[2][0]
+            out.field[end] = _like(_axis(np.cos(2 * direction[near]).sum(), np.sin(2 * direction[near]).sum()), outward)
+            axis = _axis(x @ x - y @ y, 2 * x @ y)
             tangent = _like(axis, outward) if s[-1] > SHORT else out.field[end]
             out.tangent[end] = tangent
             # An end lies on its piece's axis rather than on the outermost point.
@@ -209,6 +209,12 @@ def join(pairs: Ints, n_ends: int) -> Ints:
             rows[rows == other] = one
     out: Ints = np.unique(rows, return_inverse=True)[1]
     return out
+
+
+def _axis(cosine: float, sine: float) -> Values:
+    """Unit vector (2,) of half the angle with such a cosine and sine, or multiples of them."""
+    half = np.arctan2(sine, cosine) / 2
+    return np.array([np.cos(half), np.sin(half)])
 
 
 def _like(axis: Values, way: Values) -> Values:
