@@ -136,7 +136,7 @@ def _caps(polygons: Floats) -> Ints:
         a, b, c = np.moveaxis(flat[each[:, None, None], corners], 2, 0)
         best = (2 * _ears(a, b, c) + _fatness(a, b, c)).argmax(axis=1)
         triangles.append(corners[each, best])
-        left = left[np.arange(left.shape[1]) != best[:, None]].reshape(len(left), -1)
+        left = left[np.arange(left.shape[1]) != best[:, None]].reshape(len(left), left.shape[1] - 1)
     return np.stack([*triangles, left], axis=1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, uniform_filter
+from scipy.ndimage import binary_erosion, binary_opening, distance_transform_edt, gaussian_filter, uniform_filter
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
@@ -106,7 +106,7 @@ def canopy_cover(
     blocks = [block_sum(layer, k) for layer in counts]
     touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
     if touching.any():
-        touching &= ~binary_dilation(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), _disc(WIDEST, side))
+        touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
     apart = _apart(touching, body, crown, grid, metres, resolution)
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = body
@@ -133,7 +133,7 @@ def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Gri
     blocks = Grid(grid.west, grid.north, _side(resolution), *touching.shape)
     out[cells_in(metres, blocks)[touching]] = True
     touch = out.reshape(metres.shape)
-    near, about = (binary_dilation(touch, _disc(reach, metres.resolution)) for reach in (BESIDE, ABOUT))
+    near, about = (_grown(touch, reach, metres.resolution) for reach in (BESIDE, ABOUT))
     cells = cells_in(metres, grid).ravel()
     plants, high = (np.bincount(cells, layer.ravel(), metres.ny * metres.nx) for layer in (body, crown))
     lower = (high < LOWER * plants).reshape(metres.shape)
@@ -185,16 +185,14 @@ def _closed(total: Values, high: Values, side: float, width: float) -> Flags:
         closed = _around(high) > 0.5 * np.maximum(_around(total), 1)
     else:
         closed = uniform_filter((high > 0.5 * np.maximum(total, 1)).astype(np.float32), 3) > 0.5
-    out: Flags = binary_opening(closed, _disc(width / 2, side))
-    return out
+    return _grown(binary_erosion(closed, _disc(width / 2, side)), width / 2, side)
 
 
 def _no_vines(total: Values, canopy: Values, above: Values, side: float) -> Flags:
     """Blocks of cells of objects taller or wider than a row of vines, with half a metre around them."""
     tall = _around(above)
     high = binary_opening((tall > 2.5) & (tall > 0.15 * _around(total)), np.ones((3, 3)))
-    out: Flags = binary_dilation(high | _closed(total, canopy + above, side, WIDEST), _disc(0.5, side))
-    return out
+    return _grown(high | _closed(total, canopy + above, side, WIDEST), 0.5, side)
 
 
 def _around(blocks: Values) -> Values:
@@ -211,6 +209,14 @@ def _cells_a_block(resolution: float) -> int:
 def _side(resolution: float) -> float:
     """Metres of a block of cells."""
     return _cells_a_block(resolution) * resolution
+
+
+def _grown(cells: Flags, radius: float, side: float) -> Flags:
+    """Cells, and those within some metres of them."""
+    if not cells.any():
+        return cells
+    out: Flags = distance_transform_edt(~cells, side) <= radius
+    return out
 
 
 def _disc(radius: float, cell: float) -> Flags:
