@@ -29,6 +29,8 @@ FLANK = 4.0
 """Metres before and after a gap in which the rows stand that must end there for it to be a track."""
 ACROSS = 6
 """Rows on each side of a gap that are looked at for a track."""
+MOST = 0.8
+"""Share of those rows that end there at a track."""
 OPEN = 0.62
 """Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
 STRIDE = 0.5
@@ -147,8 +149,8 @@ def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: flo
     """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
     What lies farther than half a track from all key points is open ground. The gap lies on a track if the open ground
-    about its middle goes on across all the rows that stand beside its ends, up to ``ACROSS`` on each side: missing
-    vines of some neighbours may line up, those of all don't.
+    about its middle goes on across ``MOST`` of the rows that stand beside its ends, up to ``ACROSS`` on each side:
+    missing vines of some neighbours may line up, those of all don't, but something may stand at a track's side.
     """
     tree = cKDTree(xy)
     out = np.zeros(len(pairs), dtype=bool)
@@ -167,7 +169,8 @@ def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: flo
         sides = [side[(side >= 1) & (side <= ACROSS)] for side in (standing, -standing)]
         if sum(map(len, sides)) > 1:
             open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
-            out[k] = all((side <= far).all() for side, far in zip(sides, open_to, strict=True))
+            crossed = sum(np.count_nonzero(side <= far) for side, far in zip(sides, open_to, strict=True))
+            out[k] = crossed >= MOST * sum(map(len, sides))
     return out
 
 
