@@ -117,7 +117,7 @@ class FitOptions(Options):
 class JudgingOptions(Options):
     """What is a row, and what isn't."""
 
-    min_confidence: Share = Field(0.3, description="confidence below which it is none, but stands in unmapped")
+    min_confidence: Share = Field(0.45, description="confidence below which it is none, but stands in unmapped")
 
 
 class MissingOptions(Options):

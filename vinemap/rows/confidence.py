@@ -98,7 +98,7 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDat
 
 
 def believed(
-    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, min_confidence: float = 0.3
+    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, min_confidence: float = 0.45
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Rows that are at least so sure, and their gaps: less sure ones are more often none than not.
 

@@ -35,6 +35,8 @@ BESIDE = 1.3
 """Spacings within which a row runs beside another."""
 LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
 """Canopy and width of a row, in those of the parcel's typical row."""
+SPARSE = 0.65
+"""Share of the length on which most rows have canopy, as bushes that stand apart do, from which one is a row."""
 CLOSED = 0.9
 """Spacings across which the canopy of a row may be closed."""
 ZIGZAG = 12.0
@@ -79,7 +81,7 @@ def trace_rows(
     max_width : float
         Metres of canopy across beyond which it isn't a vine row, nine tenths of the spacing at the least.
     min_support : float
-        Share of its length on which a row must have canopy.
+        Share of its length on which a row must have canopy, or ``SPARSE`` of what most have where that is less.
 
     Returns
     -------
@@ -90,25 +92,28 @@ def trace_rows(
     xy, direction = key_points.get_coordinates().to_numpy(), np.radians(key_points["direction_deg"].to_numpy())
     spacing, curtains = key_points["spacing_m"].to_numpy(), key_points["curtains_m"].to_numpy()
 
-    def trace(members: Ints) -> tuple[float, float, float, float, shapely.LineString] | None:
+    def trace(members: Ints) -> tuple[float, float, float, float, float, shapely.LineString] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
         between, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
         course = _centred(ordered, cover, between, double) if len(ordered) > 1 else None
-        if course is None or course.width > max(max_width, CLOSED * between) or course.support < min_support:
+        if course is None or course.width > max(max_width, CLOSED * between):
             return None
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
         fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
-        return (between, double, course.width, course.amount, line) if fits else None
+        return (between, double, course.width, course.amount, course.support, line) if fits else None
 
     clusters = key_points.groupby("cluster").indices
     records = [record for record in in_threads(trace, clusters.values()) if record]
-    columns = ("spacing_m", "curtains_m", "width", "amount")
+    columns = ("spacing_m", "curtains_m", "width", "amount", "support")
     rows = gpd.GeoDataFrame(
         {name: [r[k] for r in records] for k, name in enumerate(columns)},
         geometry=[r[-1] for r in records],
         crs=key_points.crs,
     )
+    if len(rows):
+        usual = rows["support"].iloc[_typical(rows["support"].to_numpy(), rows.length.to_numpy())]
+        rows = rows[rows["support"] >= min(min_support, SPARSE * usual)]
     rows["simple"] = shapely.simplify(rows.geometry.to_numpy(), 0.02)
     rows = rows[~_repeated(rows)]
     rows = rows[_like_the_others(rows)]
@@ -235,12 +240,16 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
     for members in (np.flatnonzero(group == g) for g in np.unique(group)):
         if len(members) < 3:
             continue
-        order = members[np.argsort(amount[members])]
-        half = np.cumsum(length[order]) >= 0.5 * length[members].sum()
-        typical = order[np.argmax(half)]
+        typical = members[_typical(amount[members], length[members])]
         out[members] = amount[members] >= LEAST_AMOUNT * amount[typical]
         out[members] &= (width[members] <= MOST_WIDTH * width[typical]) | enclosed[members]
     return out
+
+
+def _typical(values: Values, length: Values) -> int:
+    """Which of some rows has the median of their values (n,), each of which counts by its length (n,)."""
+    order = np.argsort(values)
+    return int(order[np.argmax(np.cumsum(length[order]) >= 0.5 * length.sum())])
 
 
 def _enclosed(rows: gpd.GeoDataFrame, pairs: Ints) -> Flags:
