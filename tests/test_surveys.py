@@ -126,7 +126,7 @@ def test_the_real_row(shared):
     line = shapely.LineString([(0, middle, 0), (1.9, middle, 0)])
     rows = gpd.GeoDataFrame({"row_id": [1], "label": ["1"], "spacing_m": [2.5]}, geometry=[line], crs=points.crs)
     none = gpd.GeoDataFrame({key: np.empty(0) for key in ("row_id", "start_m", "end_m")}, geometry=[], crs=points.crs)
-    found = RowMap(points.above(dtm), dtm, None, None, None, 0, rows, none)
+    found = RowMap(points.above(dtm), dtm, None, None, None, None, 0, rows, none)
     model = model_canopies(found, Settings())
     rows = summarise_rows(rows, model.table, step=0.25)
     assert len(model.table) == 9

@@ -25,7 +25,8 @@ from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.unmapped import find_unmapped
-from vinemap.geo.crs import check_near, corner_of
+from vinemap.geo.crs import check_near, corner_of, project
+from vinemap.geo.raster import grid_over
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.pages.parcel import write_page
@@ -37,7 +38,7 @@ from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.clusters import cluster_rows
 from vinemap.rows.confidence import believed, judge_rows
 from vinemap.rows.curves import trace_rows
-from vinemap.rows.ends import count_missing
+from vinemap.rows.ends import beyond_ends, count_missing
 from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
@@ -45,6 +46,7 @@ from vinemap.rows.numbers import describe_rows, number_rows
 from vinemap.surfaces.ceiling import heights_of_vines
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
+from vinemap.surfaces.seen import seen_cells
 from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
+    import shapely
     from pyproj import CRS
 
     from vinemap.canopy.foliage import Canopy
@@ -61,27 +64,15 @@ if TYPE_CHECKING:
     from vinemap.geo.crs import Origin
     from vinemap.geo.raster import Raster
     from vinemap.rows.waves import RowField
+    from vinemap.surfaces.seen import Seen
 
 T = TypeVar("T")
 
 BYTES_A_POINT = 60
 """Memory that a run takes: half of the machine's is for it."""
 
-STAGES = (
-    "Reading",
-    "DTM",
-    "Canopy cover",
-    "Row field",
-    "Key points",
-    "Clusters",
-    "Curves",
-    "Ends and gaps",
-    "Sections",
-    "Canopy",
-    "Mesh",
-    "Unmapped",
-    "Writing",
-)
+STAGES: tuple[str, ...] = ("Reading", "DTM", "Canopy cover", "Row field", "Key points", "Clusters", "Curves")
+STAGES += ("Ends and gaps", "Sections", "Canopy", "Mesh", "Unmapped", "Writing")
 
 
 class Summary(NamedTuple):
@@ -119,22 +110,30 @@ class RowMap(NamedTuple):
     dtm: Raster
     chm: Raster
     cover: Raster
+    seen: Seen
+    """What the cloud shows."""
     field: RowField
     n_key_points: int
     rows: gpd.GeoDataFrame
     gaps: gpd.GeoDataFrame
 
 
-def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster]:
-    """Find the terrain of a cloud: the cloud with its heights above it, the terrain, and the canopies' height."""
+def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster, Seen]:
+    """Find a cloud's terrain: the cloud with its heights above it, the terrain, the canopies' height, what was seen."""
     dtm = terrain_model(points, **settings.ground.model_dump())
-    how = {"resolution": settings.ground.resolution, "high": settings.cover.high}
-    cloud, chm = heights_of_vines(points, dtm, **how)
+    cloud, chm = heights_of_vines(points, dtm, resolution=settings.ground.resolution, high=settings.cover.high)
+    seen = seen_cells(points, grid_over(*points.extent, resolution=settings.cover.resolution))
     cloud.forget()
-    return cloud, dtm, chm
+    return cloud, dtm, chm, seen
 
 
-def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[..., Any] = call) -> RowMap:
+def map_rows(
+    points: Cloud,
+    settings: Settings | None = None,
+    *,
+    within: shapely.Geometry | None = None,
+    step: Callable[..., Any] = call,
+) -> RowMap:
     """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2).
 
     Parameters
@@ -143,6 +142,8 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
         The parcel's points.
     settings : Settings, optional
         Settings of the stages.
+    within : Geometry, optional
+        The polygon to which the points were clipped, in their CRS: rows end where it does.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -153,17 +154,17 @@ def map_rows(points: Cloud, settings: Settings | None = None, *, step: Callable[
     """
     settings = settings or Settings()
     options = settings.model_dump()
-    cloud, dtm, chm = step("DTM", map_surfaces, points, settings)
+    cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
     clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
     courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     options["fit"]["high"] = settings.cover.high
-    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, **options["fit"])
-    rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm), gaps, **options["judging"])
+    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, seen, within, **options["fit"])
+    rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm, seen), gaps, **options["judging"])
     rows, gaps = count_missing(*number_rows(flag_rows(rows), gaps), **options["missing"])
-    return RowMap(cloud, dtm, chm, cover, refine_row_field(field, rows), len(key_points), rows, gaps)
+    return RowMap(cloud, dtm, chm, cover, seen, refine_row_field(field, rows), len(key_points), rows, gaps)
 
 
 def map_parcel(
@@ -252,42 +253,38 @@ def follow(
         points = _read(recipe, piece, draft, run)
         if origin:
             check_near(origin, points.extent[0], points.crs)
-        seen = map_rows(points, settings, step=run)
-        rows, gaps = seen.rows, seen.gaps
-        model = model_canopies(seen, settings, step=run)
-        main = origin or corner_of(seen.dtm)
-        sized = summarise_rows(rows, model.table, step=settings.sections.step)
-        rows, ends, enhanced = describe_rows(
-            judge_canopies(sized, model.table, step=settings.sections.step),
-            parcel=parcel,
-            origin=main,
-            threshold=settings.curves.threshold,
-        )
-        meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=settings.sections.step)
-        outlines = parcel_layer(parcel, rows, recipe.boundary, points)
-        within = outlines if recipe.boundary else None
+        polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
+        found = map_rows(points, settings, within=polygon, step=run)
+        model, apart = model_canopies(found, settings, step=run), settings.sections.step
+        main = origin or corner_of(found.dtm)
+        rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
+        beyond = beyond_ends(rows, found.seen, polygon)
+        rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
+        meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
+        outlines = parcel_layer(parcel, rows, polygon, points)
+        around = outlines if polygon else None
         layers = {
             "rows": rows,
-            "row_ends": ends,
+            "row_ends": ends.assign(beyond=beyond),
             "key_points": enhanced,
             "sections": labelled(model.table, rows),
-            "gaps": labelled(gaps, rows),
-            "unmapped": run("Unmapped", find_unmapped, seen.chm, rows, within, tallest=settings.cover.high),
+            "gaps": labelled(found.gaps, rows),
+            "unmapped": run("Unmapped", find_unmapped, found.chm, rows, around, tallest=settings.cover.high),
             "parcel": outlines,
         }
 
         def write() -> None:
             how: dict[str, Any] = {"date": recipe.flown} | settings.product.model_dump(include={"plain", "geoid"})
-            write_product(draft, parcel, layers, (seen.dtm, seen.chm), seen.field, meshes, points, **how)
+            write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, **how)
             if settings.product.classified:
-                classify = partial(classify_points, leaves=_leaves(seen, settings))
-                write_classified(seen.cloud, classify, paths.classified_cloud(draft, parcel))
+                classify = partial(classify_points, leaves=_leaves(found, settings))
+                write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
-        about: dict[str, Any] = {"n_key_points": seen.n_key_points, "square": seen.field.square}
-        record = record_of(recipe, seen.cloud, layers, seen.chm, origin=main, **about)
+        about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
+        record = record_of(recipe, found.cloud, layers, found.chm, origin=main, **about)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        record["warnings"] += write_page(draft, record, layers, seen.dtm, seen.chm)
+        record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {
             "created": datetime.now(UTC).isoformat(timespec="seconds"),

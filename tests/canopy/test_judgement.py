@@ -21,6 +21,8 @@ def rows_of(heights, widths=0.5, block=1, apart=2.5):
         "block": block,
         "spacing_m": apart,
         "gap_m": 0.0,
+        "unseen_m": 0.0,
+        "cut": 0.0,
         "bottom_m": 0.5,
         "flags": "",
     }
@@ -44,6 +46,8 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
     jagged = 0.5 + np.random.default_rng(0).uniform(-0.2, 0.2, N)
     assert confidence(sections_of(n=N // 2)) == pytest.approx(0.5, abs=0.02)
     assert confidence(sections_of(n=N // 2), gap_m=LENGTH / 2) == pytest.approx(1, abs=0.03)
+    assert confidence(sections_of(n=N // 2), gap_m=LENGTH / 4, unseen_m=LENGTH / 4) == pytest.approx(1, abs=0.03)
+    assert confidence(sections_of(), cut=0.7) == pytest.approx(0.3, abs=0.01)
     assert confidence(sections_of(seen=0.55)) == pytest.approx(2 / 7)
     assert confidence(sections_of(width=jagged)) < 0.5
     assert confidence(sections_of(n=3), gap_m=LENGTH - 1) == 0

@@ -30,7 +30,9 @@ AZIMUTH, SPACING = 40.0, 2.4
 
 def found(survey, dtm, field):
     """A map that holds the survey's true rows and gaps."""
-    return RowMap(None, dtm, None, field.likelihood, field, 0, survey.rows[["geometry"]], survey.gaps[["geometry"]])
+    return RowMap(
+        None, dtm, None, field.likelihood, None, field, 0, survey.rows[["geometry"]], survey.gaps[["geometry"]]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,7 @@ def model(survey, grown=0.0):
 
 def errors(survey, ours):
     rows = survey.rows[["geometry"]].assign(row_id=survey.rows["row"])
-    found = RowMap(None, None, None, None, None, 0, rows, None)
+    found = RowMap(None, None, None, None, None, None, 0, rows, None)
     pairs = pd.DataFrame({"row_id": [1, 2, 3], "reference": [1, 2, 3]})
     return compare_canopies(survey, found, ours, ours, pairs, step=0.1)
 

@@ -16,18 +16,19 @@ CONTRACT = {
     "rows": (
         "row_id label length_m orientation_deg elevation_m elevation_diff_m n_key_points e1_x e1_y e1_z en_x en_y en_z "
         "e1_lat e1_lon e1_alt en_lat en_lon en_alt spacing_m height_m width_m volume_m3 gap_m "
-        "n_missing block support confidence flags bottom_m trv_m3_ha lwa_m2_ha canopy_confidence"
+        "n_missing block support confidence flags bottom_m trv_m3_ha lwa_m2_ha canopy_confidence unseen_m"
     ).split(),
-    "row_ends": "row_id label end".split(),
+    "row_ends": "row_id label end beyond".split(),
     "key_points": "row_id label order position_m".split(),
     "sections": (
         "row_id label position_m height_m bottom_m width_m area_m2 n_points "
         "trv_m3_ha lwa_m2_ha good under over reduction quality"
     ).split(),
-    "gaps": "row_id label start_m end_m length_m n_missing".split(),
+    "gaps": "row_id label start_m end_m length_m n_missing state".split(),
     "unmapped": "reason area_m2 share height_m width_m".split(),
     "parcel": (
-        "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m n_missing vine_spacing_m vertical_datum"
+        "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m n_missing vine_spacing_m vertical_datum "
+        "unseen_m"
     ).split(),
 }
 GEOMETRY = {

@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.product.notices import height_notices, notices
+from vinemap.product.notices import height_notices, notices, sight_notices
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
@@ -196,3 +196,16 @@ def test_no_row_among_heights_that_no_vineyard_has(height, told):
 
 def test_no_points_have_no_heights():
     assert height_notices(rows(), chm(box(-1, -1, 61, 41))) == []
+
+
+def test_what_was_not_seen_of_rows():
+    some = rows(1, 1, 1).assign(unseen_m=[0.0, 3.2, 2.04])
+    ends = gpd.GeoDataFrame(
+        {"row_id": [1, 1, 2, 2, 3, 3], "beyond": ["seen", "outside", *["unseen"] * 2, "seen", "seen"]}
+    )
+    assert sight_notices(some, ends) == [
+        "5.2 m of 2 of 3 rows were not seen: whether vines stand there is not known, and none is counted as missing",
+        "1 of 3 rows may go on: beyond their ends nothing was seen",
+    ]
+    assert sight_notices(some.assign(unseen_m=0.0), ends.assign(beyond="outside")) == []
+    assert sight_notices(some[:0], ends[:0]) == []

@@ -80,7 +80,8 @@ def test_the_bare_geopackage_is_styled(layers):
     assert layers["rows"]["labels"]
     assert layers["rows"]["renderer"] == layers["sections"]["renderer"] == "graduatedSymbol"
     assert all("m³/m" in c["label"] for c in layers["rows"]["classes"])
-    assert layers["gaps"]["colour"] == "#d7263d"
+    assert layers["gaps"]["renderer"] == "categorizedSymbol"
+    assert layers["gaps"]["classes"] == [{"label": "missing", "colour": "#d7263d"}]
     assert layers["unmapped"]["renderer"] == "categorizedSymbol"
     assert layers["unmapped"]["classes"][-1] == {"label": "too tall", "colour": "#566a8c"}
     assert layers["sections"]["scale"] == 800

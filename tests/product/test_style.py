@@ -67,7 +67,7 @@ def test_colours_as_qgis_writes_them():
 
 def test_a_row_without_canopy_is_in_the_lowest_class():
     rows = gpd.GeoDataFrame(
-        {"label": ["1", "2", "3"], "length_m": [100.0] * 3, "volume_m3": [90.0, np.nan, 30.0]},
+        {"label": ["1", "2", "3"], "length_m": [100.0] * 3, "unseen_m": 0.0, "volume_m3": [90.0, np.nan, 30.0]},
         geometry=[shapely.LineString([(0, k), (100, k)]) for k in range(3)],
         crs=32632,
     )
@@ -78,12 +78,27 @@ def test_a_row_without_canopy_is_in_the_lowest_class():
 
 def test_rows_bear_their_numbers_on_the_map():
     rows = gpd.GeoDataFrame(
-        {"row_id": [12], "label": ["12 Vigna di San Lorenzo"], "length_m": [100.0], "volume_m3": [90.0]},
+        {
+            "row_id": [12],
+            "label": ["12 Vigna di San Lorenzo"],
+            "length_m": [100.0],
+            "unseen_m": [0.0],
+            "volume_m3": [90.0],
+        },
         geometry=[shapely.LineString([(0, 0), (100, 0)])],
         crs=32632,
     )
     (text,) = ET.fromstring(vector_style("rows", rows).qml()).iter("text-style")
     assert text.get("fieldName") == "row_id"
+
+
+@pytest.mark.parametrize("states", [["missing"], ["missing", "unseen"]])
+def test_what_was_not_seen_of_rows_looks_unlike_gaps(states):
+    gaps = gpd.GeoDataFrame({"row_id": 1, "state": states}, geometry=[shapely.Point(0, 0)] * len(states), crs=32632)
+    style = ET.fromstring(vector_style("gaps", gaps).qml())
+    assert [category.get("value") for category in style.iter("category")] == states
+    looks = [{one.get("name"): one.get("value") for one in symbol.iter("Option")} for symbol in style.iter("symbol")]
+    assert [look["line_color"] for look in looks] == [rgba("#d7263d"), rgba("#8b8f96")][: len(states)]
 
 
 @pytest.mark.parametrize("kind", ["dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood"])

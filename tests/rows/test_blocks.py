@@ -67,9 +67,8 @@ def gaps_of(rng, spacing, n_rows=15, n_vines=100, dead=0.05, jitter=0.05):
             records.append((row, start, end, end - start, b - a))
     table = np.array(records)
     names = ["row_id", "start_m", "end_m", "length_m", "truth"]
-    return gpd.GeoDataFrame(dict(zip(names, table.T, strict=True)), geometry=[None] * len(table)).astype(
-        {"row_id": int}
-    )
+    columns = dict(zip(names, table.T, strict=True)) | {"state": "missing"}
+    return gpd.GeoDataFrame(columns, geometry=[None] * len(table)).astype({"row_id": int})
 
 
 @pytest.mark.parametrize("spacing", [0.8, 0.905, 1.0, 1.2, 1.5])
@@ -90,7 +89,7 @@ def test_no_order_no_vine_spacing():
         {"row_id": np.repeat(np.arange(1, 16), 4), "start_m": start, "end_m": start + rng.uniform(0.8, 4, 60)},
         geometry=[None] * 60,
     )
-    gaps["length_m"] = gaps["end_m"] - gaps["start_m"]
+    gaps = gaps.assign(length_m=gaps["end_m"] - gaps["start_m"], state="missing")
     assert estimate_vine_spacing(gaps) is None
     rows = rows_frame(parallel(15, 0, np.array([0, 0])), row_id=np.arange(1, 16))
     assert count_missing(rows, gaps)[0]["vine_spacing_m"].iloc[0] == 1.0

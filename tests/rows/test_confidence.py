@@ -8,12 +8,14 @@ import shapely
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.confidence import believed, judge_rows
+from vinemap.surfaces.seen import Seen
 
 SPACING = 2.5
+NO_GAPS = gpd.GeoDataFrame({"row": np.empty(0, dtype=int)}, geometry=[])
 
 
-def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0):
-    """Rows judged over ground on which canopies stand along them, and along other lines."""
+def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=()):
+    """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids."""
     table = {"spacing_m": np.full(len(lines), SPACING), "support": support, "contrast": contrast}
     rows = gpd.GeoDataFrame(table, geometry=[shapely.LineString(line) for line in lines], crs=32632)
     wide, high = (
@@ -28,8 +30,13 @@ def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0
             xs, ys = np.array(sorted(np.asarray(line).tolist())).T
             there = (np.abs(y[:, None] - np.interp(x, xs, ys)) <= w / 2) & (x >= xs[0]) & (x <= xs[-1])
             values[there] = h if tall else 1.0
+        hidden = shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(x, y))
+        values[hidden] = np.nan if tall else 0.0
         rasters.append(Raster(values, grid, rows.crs))
-    return flag_rows(judge_rows(group_blocks(rows), *rasters))
+    grid = rasters[0].grid
+    shown = ~shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(*grid.centres()))
+    rows = judge_rows(group_blocks(rows), *rasters, Seen(shown, grid, shown, grid))
+    return flag_rows(rows)
 
 
 def block(n, length=60.0, at=(0, 0)):
@@ -51,7 +58,7 @@ def test_flags():
 
 def test_rows_of_a_block_are_sure():
     assert judged(block(6))["confidence"].min() > 0.9
-    few = flag_rows(judge_rows(judged(block(6)).iloc[:0], None, None))
+    few = flag_rows(judge_rows(judged(block(6)).iloc[:0], None, None, None))
     assert few.empty
     assert {"confidence", "flags"} <= set(few)
 
@@ -74,6 +81,35 @@ def test_a_row_that_stops_where_others_run_through_is_a_piece_of_one():
     found = judged([*rows[:2], *rows[3:], *pieces])
     assert found["confidence"].iloc[:4].min() > 0.9
     assert found["confidence"].iloc[4:].max() < 0.7
+
+
+def test_that_others_run_through_says_nothing_where_it_was_not_seen():
+    rows = block(5)
+    pieces = [rows[2] * [0.4, 1], rows[2] * [0.3, 1] + [42, 0]]
+    found = judged([*rows[:2], *rows[3:], *pieces], voids=[shapely.box(23, 3.5, 43, 6.5)])
+    assert found["confidence"].min() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("voids", "cut"),
+    [
+        ([], 0),
+        ([shapely.box(-5, -5, 70, -0.1)], 1),  # a boundary through the canopy, or the end of the cloud
+        ([shapely.box(-5, -5, 70, 0)], 1),
+        ([shapely.box(20, -5, 70, -0.1)], 2 / 3),
+        ([shapely.Polygon([(-5, -5), (70, -5), (70, 0.5), (-5, -4)])], 0.15),  # oblique
+        ([shapely.box(30, 0.1, 36, 1.8)], 0.1),  # a void beside it
+        ([shapely.box(-5, -5, 70, -0.8)], 0),  # ground was seen beside it
+        ([shapely.box(20, -5, 26, 20)], 0),  # across it
+    ],
+)
+def test_a_row_whose_canopy_is_cut_is_at_an_edge_and_less_sure(voids, cut):
+    found, whole = (believed(judged(block(5), voids=cut_by), NO_GAPS)[0] for cut_by in (voids, ()))
+    assert found["cut"].iloc[0] == pytest.approx(cut, abs=0.05)
+    assert found["flags"].tolist() == ["edge" if cut else "", "", "", "", ""]
+    lower = whole["confidence"].iloc[0] - found["confidence"].iloc[0]
+    assert lower > 0.08 if cut > 0.9 else lower > 0.003 if cut else abs(lower) < 0.02
+    assert found["confidence"].iloc[1:].to_numpy() == pytest.approx(whole["confidence"].iloc[1:].to_numpy(), abs=0.02)
 
 
 def test_a_row_that_crosses_where_all_others_end_is_two():
@@ -104,7 +140,7 @@ def test_it_does_not_matter_which_end_a_row_starts_at():
 
 def test_rows_that_are_hardly_sure_are_none():
     lines = [shapely.LineString([(0, k), (9, k)]) for k in range(3)]
-    rows = gpd.GeoDataFrame({"confidence": [0.9, 0.1, 0.8], "block": [1, 2, 3]}, geometry=lines)
+    rows = gpd.GeoDataFrame({"confidence": [0.9, 0.1, 0.8], "cut": 0.0, "block": [1, 2, 3]}, geometry=lines)
     gaps = gpd.GeoDataFrame({"row": [0, 1, 2, 2]}, geometry=list(rows.geometry.iloc[[0, 1, 2, 2]]))
     kept, theirs = believed(rows, gaps)
     assert list(kept["confidence"]) == [0.9, 0.8]
@@ -113,3 +149,6 @@ def test_rows_that_are_hardly_sure_are_none():
     assert all(line.equals(kept.geometry[row]) for row, line in zip(theirs["row"], theirs.geometry, strict=True))
     none, nothing = believed(rows, gaps, min_confidence=1.0)
     assert len(none) == len(nothing) == 0
+    less = believed(rows.assign(cut=[0.5, 0, 1]), gaps)[0]["confidence"]
+    assert less.tolist() == pytest.approx([0.9 / (0.9 + 0.1 * np.e), 0.8 / (0.8 + 0.2 * np.e**2)])
+    assert believed(rows.assign(cut=1.0), gaps, min_confidence=0.7)[0]["confidence"].tolist() == [0.7, 0.7]

@@ -13,6 +13,7 @@ from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.curves import order_key_points, trace_rows
 from vinemap.rows.fit import fit_rows
 from vinemap.surfaces.cover import Levels
+from vinemap.surfaces.seen import seen_cells
 
 UTM = CRS.from_epsg(32632)
 
@@ -64,7 +65,12 @@ def level_of(scene):
 
 def fit(scene):
     courses = trace_rows(scene.key_points, scene.cover)
-    return fit_rows(courses, scene.cloud, scene.cover, level_of(scene), scene.dtm)
+    return fit_to(courses, scene)
+
+
+def fit_to(courses, scene):
+    seen = seen_cells(scene.cloud, scene.cover.grid)
+    return fit_rows(courses, scene.cloud, scene.cover, level_of(scene), scene.dtm, seen)
 
 
 def arc(radius=40.0, angle=1.0, n=200):
@@ -114,7 +120,7 @@ def test_wiggle_of_key_points_does_not_reach_the_curve():
 def test_no_courses():
     empty = scene([np.array([[0, 0], [10.0, 0]])])
     courses = trace_rows(empty.key_points.iloc[:0], empty.cover)
-    rows, gaps = fit_rows(courses, empty.cloud, empty.cover, level_of(empty), empty.dtm)
+    rows, gaps = fit_to(courses, empty)
     assert len(rows) == len(gaps) == 0
 
 
@@ -155,6 +161,6 @@ def test_a_bush_as_long_as_a_row_is_none():
         geometry=[shapely.LineString([(0.2, 0.1), (11.8, 0.1)])],
         crs=UTM,
     )
-    assert len(fit_rows(courses, bush.cloud, bush.cover, level_of(bush), bush.dtm)[0]) == 0
+    assert len(fit_to(courses, bush)[0]) == 0
     row = scene([np.array([[0, 0], [12.0, 0]])], width=0.7)
-    assert len(fit_rows(courses, row.cloud, row.cover, level_of(row), row.dtm)[0]) == 1
+    assert len(fit_to(courses, row)[0]) == 1

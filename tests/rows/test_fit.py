@@ -7,6 +7,7 @@ from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import Raster, grid_over
 from vinemap.rows.fit import fit_rows
 from vinemap.surfaces.cover import Levels
+from vinemap.surfaces.seen import seen_cells
 
 
 @pytest.mark.parametrize(("start", "end"), [(2.5, 13.5), (6, 11)])
@@ -26,7 +27,7 @@ def test_wide_canopies_have_their_middle_between_their_flanks_and_are_followed_t
         geometry=[shapely.LineString([(start, 0.3), (end, 0.3)])],
     )
     dtm = Raster(np.zeros(metres.shape, np.float32), metres, None)
-    rows, _ = fit_rows(course, cloud, Raster(of_ridges, fine, None), levels, dtm)
+    rows, _ = fit_rows(course, cloud, Raster(of_ridges, fine, None), levels, dtm, seen_cells(cloud, fine))
     line = shapely.get_coordinates(rows.geometry.iloc[0])
     assert np.abs(line[:, 1]).max() < 0.03
     assert np.allclose(line[[0, -1], 0], [2, 14], atol=0.06)

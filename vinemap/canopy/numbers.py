@@ -222,24 +222,26 @@ def _lengths(sections: gpd.GeoDataFrame, step: float) -> Values:
 def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
     """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
 
-    The confidence, from 0 to 1, is the product of four shares: of the row's length without its gaps that has sections;
-    of the canopy that was seen, on both sides from its lowest points to its top; of the underside that isn't hidden,
-    as it is where a canopy is wider than deep; and of the agreement of sections a metre apart in width and area, in
-    which canopies of one row don't differ much. Flagged are heights and widths whose
-    ratio to the median of their block, or of the rows around one that is of no block, is odd, if rows there don't
-    differ anyway.
+    The confidence, from 0 to 1, is the product of five shares: of the row's length without its gaps that has sections;
+    of the canopy that isn't cut at a side; of the canopy that was seen, on both sides from its lowest points to its
+    top; of the underside that isn't hidden, as it is where a canopy is wider than deep; and of the agreement of
+    sections a metre apart in width and area, in which canopies of one row don't differ much. Flagged are heights and
+    widths whose ratio to the median of their block, or of the rows around one that is of no block, is odd, if rows
+    there don't differ anyway.
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineString with ``block``, ``spacing_m``, ``gap_m``, ``flags``, ``height_m``, ``bottom_m`` and ``width_m``.
+        LineString with ``block``, ``spacing_m``, ``gap_m``, ``unseen_m``, ``cut``, ``flags``, ``height_m``,
+        ``bottom_m`` and ``width_m``.
     sections : GeoDataFrame
         Sections of these rows.
     step : float
         Metres between sections.
     """
     row = sections["row_id"].to_numpy()
-    canopy = np.maximum(shapely.length(rows.geometry.to_numpy()) - rows["gap_m"].to_numpy(dtype=float), step)
+    gaps, cut = (rows[name].to_numpy(dtype=float) for name in (["gap_m", "unseen_m"], "cut"))
+    canopy = np.maximum(shapely.length(rows.geometry.to_numpy()) - gaps.sum(axis=1), step)
     table = pd.DataFrame(
         {
             "modelled": pd.Series(_lengths(sections, step)).groupby(row).sum(),
@@ -248,6 +250,7 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
         }
     ).reindex(rows["row_id"])
     confidence = np.minimum(table["modelled"].to_numpy() / canopy, 1) * _between(table["seen"].to_numpy(), SEEN)
+    confidence *= 1 - cut
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
     height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
     confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)

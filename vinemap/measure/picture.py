@@ -19,7 +19,8 @@ from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
 
 from vinemap import paths
 from vinemap.product.gltf import read_glb
-from vinemap.product.qgis.style import CANOPY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
+from vinemap.product.qgis.style import CANOPY, GREY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
+from vinemap.rows.ends import MISSING, UNSEEN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,7 +82,8 @@ def _map(axes: Axes, product: Path, parcel: str) -> None:
         angle = np.degrees(np.arctan2(y[1] - y[0], x[1] - x[0]))
         place = {"ha": "right", "va": "center", "rotation": angle, "rotation_mode": "anchor"}
         axes.annotate(str(label).split()[0] + " ", (x[0], y[0]), fontsize=6, color=INK, **place)
-    layers["gaps"].plot(ax=axes, color=RED, lw=3, capstyle="butt")
+    for state, gaps in layers["gaps"].groupby("state"):
+        gaps.plot(ax=axes, color={MISSING: RED, UNSEEN: GREY}[state], lw=3, capstyle="butt")
     layers["parcel"].boundary.plot(ax=axes, color="#5b3f8c", lw=1, ls="--")
     west, south, east, north = layers["parcel"].total_bounds
     axes.set(xlim=(west - 4, east + 1), ylim=(south - 1, north + 1), aspect="equal")

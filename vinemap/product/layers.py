@@ -8,14 +8,13 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.geo.crs import is_local, project
+from vinemap.geo.crs import is_local
 from vinemap.rows.blocks import outline_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.geo.boundaries import Boundary
 
 TEXT, WHOLE, REAL, TIME = "str", "int64", "float64", "datetime64[ms, UTC]"
 _END = ("x", "y", "z"), ("lat", "lon", "alt")
@@ -41,10 +40,10 @@ LAYERS: dict[str, Layer] = {
         | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
         | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL)
         | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT}
-        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha", "canopy_confidence"), REAL),
+        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha", "canopy_confidence", "unseen_m"), REAL),
         "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
     ),
-    "row_ends": Layer("Point Z", _ROW | {"end": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
+    "row_ends": Layer("Point Z", _ROW | {"end": TEXT, "beyond": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
     "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
     "sections": Layer(
         "LineString Z",
@@ -56,8 +55,8 @@ LAYERS: dict[str, Layer] = {
     ),
     "gaps": Layer(
         "LineString Z",
-        _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE},
-        "Stretches of rows without canopy",
+        _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE, "state": TEXT},
+        "Stretches of rows without canopy, or that were not seen",
     ),
     "unmapped": Layer(
         "MultiPolygon",
@@ -68,7 +67,7 @@ LAYERS: dict[str, Layer] = {
         "MultiPolygon",
         {"parcel": TEXT, "n_rows": WHOLE}
         | dict.fromkeys(("rows_length_m", "area_m2", "spacing_m", "orientation_deg", "gap_m"), REAL)
-        | {"n_missing": WHOLE, "vine_spacing_m": REAL, "vertical_datum": TEXT},
+        | {"n_missing": WHOLE, "vine_spacing_m": REAL, "vertical_datum": TEXT, "unseen_m": REAL},
         "The parcel, or its blocks of one direction and spacing where it was given no boundary",
     ),
 }
@@ -98,13 +97,14 @@ def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFram
     return table.assign(label=table["row_id"].map(dict(zip(rows["row_id"], rows["label"], strict=True))).astype(str))
 
 
-def parcel_layer(parcel: str, rows: gpd.GeoDataFrame, boundary: Boundary | None, points: Cloud) -> gpd.GeoDataFrame:
-    """The parcel's polygon and totals; without a boundary those of its blocks, "F 1", "F 2" if there are several."""
+def parcel_layer(
+    parcel: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry | None, points: Cloud
+) -> gpd.GeoDataFrame:
+    """The parcel's polygon and totals; without one those of its blocks, "F 1", "F 2" if there are several."""
     blocks = outline_blocks(rows)
-    if boundary or len(blocks) == 0:
-        polygon = project(*boundary, points.crs) if boundary else _extent(points)
-        totals = [_totals(parcel, rows, polygon, points)]
-        polygons = [polygon]
+    if polygon or len(blocks) == 0:
+        polygons = [polygon or _extent(points)]
+        totals = [_totals(parcel, rows, polygons[0], points)]
     else:
         polygons = list(blocks.geometry)
         names = [parcel] if len(blocks) == 1 else [f"{parcel} {block}" for block in blocks["block"]]
@@ -134,4 +134,5 @@ def _totals(name: str, rows: gpd.GeoDataFrame, polygon: shapely.Geometry, points
         "n_missing": rows["n_missing"].sum(),
         "vine_spacing_m": rows["vine_spacing_m"].median(),
         "vertical_datum": points.vertical or "",
+        "unseen_m": rows["unseen_m"].sum(),
     }

@@ -9,6 +9,7 @@ import shapely
 
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.geo.raster import block_sum, cell_of
+from vinemap.rows.ends import UNSEEN as NOT_SEEN
 from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
@@ -141,6 +142,26 @@ def height_notices(rows: gpd.GeoDataFrame, chm: Raster, *, highest: float = 3.6)
         f"{lacking} of {len(rows)} rows have no canopy that could be measured; if many should, {unit}": lacking > 0,
         f"plants are higher than {highest:g} m on {over:.0%} of the rows, and measured only so far; {unit}": over
         > MUCH,
+    }
+    return [remark for remark, holds in remarks.items() if holds]
+
+
+def sight_notices(rows: gpd.GeoDataFrame, row_ends: gpd.GeoDataFrame) -> list[str]:
+    """Remarks on what wasn't seen of rows, and may be anything.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        With ``unseen_m``.
+    row_ends : GeoDataFrame
+        With ``row_id`` and ``beyond``.
+    """
+    hidden, n = rows["unseen_m"].to_numpy(dtype=float), len(rows)
+    of, open_ones = np.count_nonzero(hidden), row_ends.loc[row_ends["beyond"] == NOT_SEEN, "row_id"].nunique()
+    remarks = {
+        f"{hidden.sum():.1f} m of {of} of {n} rows were not seen: whether vines stand there is not known, and none is "
+        "counted as missing": of > 0,
+        f"{open_ones} of {n} rows may go on: beyond their ends nothing was seen": open_ones > 0,
     }
     return [remark for remark, holds in remarks.items() if holds]
 

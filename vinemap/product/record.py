@@ -11,7 +11,7 @@ import shapely
 from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
 from vinemap.geo.place import doubts_of
-from vinemap.product.notices import height_notices, notices
+from vinemap.product.notices import height_notices, notices, sight_notices
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def record_of(
         "key": recipe.key,
         "survey": recipe.survey,
         "parcel": recipe.parcel,
+        "bounded": recipe.boundary is not None,
         "flown": recipe.flown.isoformat(),
         "inputs": [source.record() for source in recipe.sources],
         "settings": recipe.settings.model_dump(mode="json"),
@@ -80,6 +81,7 @@ def record_of(
         "warnings": _places(recipe, points)
         + _flights(points)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
+        + sight_notices(layers["rows"], layers["row_ends"])
         + height_notices(layers["rows"], chm, highest=recipe.settings.cover.high)
         + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),

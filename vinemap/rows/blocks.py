@@ -24,6 +24,8 @@ SPARSE = 0.5
 """Share of its length with canopy below which a row is sparse."""
 BOW = 0.5
 """Metres by which a row's bow may differ from its neighbours'."""
+CUT = 0.05
+"""Share of a row's canopy that is cut at a side from which it is at an edge."""
 
 
 def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
@@ -85,17 +87,18 @@ def flag_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     """Give rows ``flags``, what is odd about each, in words separated by commas.
 
     They are ``spacing`` (its nearest neighbour is half as far again as is usual in the block, or two thirds as far),
-    ``short`` (less than half the block's median length), ``sparse`` (canopy on less than half of it) and ``curved``
-    (its bow differs from its neighbours').
+    ``short`` (less than half the block's median length), ``sparse`` (canopy on less than half of it), ``curved``
+    (its bow differs from its neighbours') and ``edge`` (what was seen ends within its canopy, along 5% of it or more).
 
     Parameters
     ----------
     rows : GeoDataFrame
-        LineString with ``block`` and ``support``.
+        LineString with ``block``, ``support`` and ``cut``.
     """
     lines = shapely.force_2d(rows.geometry.to_numpy())
     length = shapely.length(lines)
-    flags: list[list[str]] = [["sparse"] if share < SPARSE else [] for share in rows["support"]]
+    odd = {"edge": rows["cut"].to_numpy() >= CUT, "sparse": rows["support"].to_numpy() < SPARSE}
+    flags: list[list[str]] = [[name for name in odd if odd[name][i]] for i in range(len(rows))]
     for _, members in rows.reset_index(drop=True).groupby("block"):
         index = members.index.to_numpy()
         if len(index) < 3:

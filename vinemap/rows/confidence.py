@@ -14,6 +14,7 @@ from vinemap.geo.raster import Raster, sample_across
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.surfaces.seen import Seen
 
 SLACK = 0.02
 """Metres to which rows' courses are needed."""
@@ -35,13 +36,17 @@ AROUND = 3.5
 """Spacings within which other rows tell whether there is a track."""
 LIKE = 4
 """Nearest rows with the second narrowest of which, for its height, a canopy is compared."""
-RIDGE = 0.35
-"""Share of a row's usual cover from which a station has canopy."""
+ASIDE = 2 / 3
+"""Spacings aside of a row where the next one's canopy begins."""
+RIDGE, FLANK = 0.35, 0.2
+"""Shares of a row's usual cover from which a station has canopy, and down to which that reaches across."""
 
 EVIDENCE = {"company": 3.0, "whole": 3.0, "alike": 3.0, "claimed": 2.0, "support": 2.0, "contrast": 4.0, "length": 4.0}
 """Logarithm of the odds by which each ingredient, from 0 to 1, makes a row more sure."""
 DOUBT = 3.3 - sum(EVIDENCE.values())
 """Logarithm of the odds of a row for which nothing speaks; 3.3, or 96%, is that of one for which everything does."""
+CUT = 2.0
+"""Logarithm of the odds by which a row is less sure all of whose canopy is cut."""
 
 
 class _Stations(NamedTuple):
@@ -73,15 +78,16 @@ class _Beside(NamedTuple):
     """Which; −1 where there is none."""
 
 
-def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDataFrame:
-    """Give rows a ``confidence`` in 0–1.
+def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -> gpd.GeoDataFrame:
+    """Give rows a ``confidence`` in 0–1, and the share of their canopy's length that is ``cut`` at a side.
 
     Confidence is the share of rows like it that are right, as far as a logistic model of seven ingredients tells it,
     each from 0 to 1 (``EVIDENCE`` has their weights): **company**, the share of the length along which another row runs
     beside it at the distance that is usual for both; **whole**, that it doesn't go on beyond its end where others go
     on, nor crosses where those beside it end; **alike**, that its canopy isn't far wider for its height than
     theirs; **claimed**, the share beside which no canopy stands where the next row ought to be; its **support**;
-    its **contrast**; and its **length** in spacings.
+    its **contrast**; and its **length** in spacings. Canopy is cut where what was seen ends within it, at a boundary or
+    at the cloud's own edge.
 
     Parameters
     ----------
@@ -91,10 +97,12 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> gpd.GeoDat
         Canopy cover 0–1.
     chm : Raster
         Canopy height in metres, NaN where there are no points.
+    seen : Seen
+        What the cloud shows.
     """
-    found = evidence(rows, cover, chm)
+    found = evidence(rows, cover, chm, seen)
     odds = DOUBT + sum((weight * found[name].to_numpy() for name, weight in EVIDENCE.items()), np.zeros(len(rows)))
-    return rows.assign(confidence=1 / (1 + np.exp(-odds)))
+    return rows.assign(confidence=1 / (1 + np.exp(-odds)), cut=found["cut"].to_numpy())
 
 
 def believed(
@@ -102,10 +110,12 @@ def believed(
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Rows that are at least so sure, and their gaps: less sure ones are more often none than not.
 
+    Those whose canopy is cut become less sure, but no less than that: what was seen of them says that they are rows.
+
     Parameters
     ----------
     rows : GeoDataFrame
-        With ``confidence`` and ``block``; blocks that are left are numbered anew, in their order.
+        With ``confidence``, ``cut`` and ``block``; blocks that are left are numbered anew, in their order.
     gaps : GeoDataFrame
         With ``row`` (position in rows).
     min_confidence : float
@@ -116,16 +126,18 @@ def believed(
     rows, gaps = rows[held].reset_index(drop=True), gaps[theirs].reset_index(drop=True)
     position = (np.cumsum(held) - 1)[gaps["row"].to_numpy(dtype=np.int64)]
     block = np.unique(rows["block"], return_inverse=True)[1].astype(np.int64) + 1
-    return rows.assign(block=block), gaps.assign(row=position)
+    sure, cut = (rows[name].to_numpy(dtype=float) for name in ("confidence", "cut"))
+    less = np.maximum(sure / (sure + (1 - sure) * np.exp(CUT * cut)), min_confidence)
+    return rows.assign(block=block, confidence=np.where(cut > 0, less, sure)), gaps.assign(row=position)
 
 
-def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> pd.DataFrame:
-    """The ingredients of rows' confidence, each from 0 to 1: ``EVIDENCE`` names them.
+def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -> pd.DataFrame:
+    """The ingredients of rows' confidence, each from 0 to 1: ``EVIDENCE`` names them; and how much of them is ``cut``.
 
     Parameters are as of :func:`judge_rows`.
     """
     if len(rows) == 0:
-        return pd.DataFrame(columns=list(EVIDENCE), dtype=float)
+        return pd.DataFrame(columns=[*EVIDENCE, "cut"], dtype=float)
     spacing = rows["spacing_m"].to_numpy(dtype=float)
     lines = shapely.simplify(shapely.force_2d(rows.geometry.to_numpy()), SLACK)
     at = _stations(lines)
@@ -136,16 +148,18 @@ def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster) -> pd.DataFrame
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     ridge = sample_across(cover, at.xy, normal, np.arange(-2, 3) * cover.grid.resolution).max(axis=1)
     level = at.median(np.where(ridge >= at.median(ridge)[at.row], ridge, np.nan))
-    shape = _aspect(at, chm, normal, np.where(ridge > RIDGE * level[at.row], usual[at.row], np.nan))
+    standing = ridge > RIDGE * level[at.row]
+    shape = _aspect(at, chm, normal, np.where(standing, usual[at.row], np.nan))
     return pd.DataFrame(
         {
             "company": at.share(_accompanied(at, beside, usual)),
-            "whole": 1 - np.maximum(_goes_on(at, usual), _crosses(at, beside, usual)),
+            "whole": 1 - np.maximum(_goes_on(at, usual, seen), _crosses(at, beside, usual)),
             "alike": _alike(lines, shape),
             "claimed": 1 - at.share(_unclaimed(at, beside, usual, cover, normal, level)),
             "support": np.minimum(rows["support"].to_numpy(dtype=float) / 0.6, 1),
             "contrast": np.clip((rows["contrast"].to_numpy(dtype=float) - 0.2) / 0.6, 0, 1),
             "length": 1 - np.exp(-shapely.length(lines) / (2 * usual)),
+            "cut": _cut(at, usual, cover, seen, normal, np.where(standing, level[at.row], np.nan)),
         }
     )
 
@@ -214,8 +228,11 @@ def _crosses(at: _Stations, beside: _Beside, usual: Values) -> Values:
     return out
 
 
-def _goes_on(at: _Stations, usual: Values) -> Values:
-    """How far rows (n,) end where another leads on and those around run through, from none of these to all."""
+def _goes_on(at: _Stations, usual: Values, seen: Seen) -> Values:
+    """How far rows (n,) end where another leads on and those around run through, from none of these to all.
+
+    What lies between must have been seen.
+    """
     ends = np.column_stack([at.start[:-1], at.start[1:] - 1]).ravel()
     row = at.row[ends]
     back = round(TANGENT / STEP)
@@ -230,10 +247,12 @@ def _goes_on(at: _Stations, usual: Values) -> Values:
     facing = (row[i] != row[j]) & (gap > 0) & ((outward[i] * outward[j]).sum(axis=1) < -STRAIGHT)
     facing &= np.abs(across) < np.minimum(0.15 * usual[row[i]] + 0.03 * gap, 0.4 * usual[row[i]])
     i, gap = i[facing], gap[facing]
+    middle = xy[i] + 0.5 * gap[:, None] * outward[i]
+    between = seen.at(middle)
+    i, gap, middle = i[between], gap[between], middle[between]
     out = np.zeros(len(at.start) - 1)
     if len(i) == 0:
         return out
-    middle = xy[i] + 0.5 * gap[:, None] * outward[i]
     tree = cKDTree(at.xy)
     for k, (end, length) in enumerate(zip(i, gap, strict=True)):
         wide = AROUND * usual[row[end]]
@@ -295,3 +314,23 @@ def _unclaimed(at: _Stations, beside: _Beside, usual: Values, cover: Raster, nor
         there = np.nan_to_num(sample_across(cover, at.xy, sign * wide, offsets)).max(axis=1)
         out |= (there > 0.6 * level[at.row]) & ~(beside.away[:, side] < UNUSUAL * usual[at.row])
     return out
+
+
+def _cut(at: _Stations, usual: Values, cover: Raster, seen: Seen, normal: Values, level: Values) -> Values:
+    """Share of the canopy of rows (n,) that reaches, at a side, to where nothing is seen from there almost to a next.
+
+    Their ends lie at an edge by themselves. ``level`` (stations,) is the cover, NaN where there is no canopy.
+    """
+    inner = np.isfinite(level)
+    inner[at.start[:-1]] = inner[at.start[1:] - 1] = False
+    cut, step = np.zeros(len(at.row), dtype=bool), cover.grid.resolution
+    far = ASIDE * usual[at.row]
+    offsets = np.arange(0.0, float(far.max()), step)
+    for side in (normal, -normal):
+        k = np.flatnonzero(inner & ~seen.at(at.xy + far[:, None] * side))
+        xy = at.xy[k, None] + offsets[:, None] * side[k, None]
+        shown = (offsets <= far[k, None]) & seen.at(xy.reshape(-1, 2)).reshape(xy.shape[:2])
+        canopy = shown & (np.nan_to_num(sample_across(cover, at.xy[k], side[k], offsets)) > FLANK * level[k, None])
+        last, flank = ((offsets * flags).max(axis=1) for flags in (shown, canopy))
+        cut[k] |= flank >= last - seen.grid.resolution - step
+    return at.share(cut) / np.maximum(at.share(inner), 1e-9)

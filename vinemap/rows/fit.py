@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-import geopandas as gpd
 import numpy as np
 import shapely
 from scipy import sparse
@@ -20,14 +19,15 @@ from scipy.sparse.linalg import spsolve
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import between, extend, normals, resample, way_along
+from vinemap.geo.curve import extend, normals, resample, way_along
 from vinemap.geo.raster import Raster, cells_in, nearest_cell, sample, sample_across
 from vinemap.rows.centre_line import CELL, USUAL, centre_line, half_width
-from vinemap.rows.ends import Standing, cut_to_canopy
+from vinemap.rows.ends import Standing, cut_to_canopy, lay_out
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    import geopandas as gpd
     from numpy.typing import NDArray
 
     from vinemap.cloud.frame import Taken
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Grid
     from vinemap.surfaces.cover import Levels
+    from vinemap.surfaces.seen import Seen
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
@@ -57,8 +58,6 @@ APART = 0.3
 """Share of a row's cover beside it up to which it stands apart from its neighbours."""
 LEAST_CONTRAST = 0.6
 """Contrast of a lone row's canopy to what lies beside it, below which it is a bush or a hedge."""
-VERTEX = 0.5
-"""Metres between the vertices of a curve."""
 
 
 class _Share(NamedTuple):
@@ -82,6 +81,8 @@ def fit_rows(
     cover: Raster,
     levels: Levels,
     dtm: Raster,
+    seen: Seen,
+    within: shapely.Geometry | None = None,
     *,
     high: float = 3.6,
     smoothing: float = 2.5,
@@ -102,8 +103,8 @@ def fit_rows(
     levels : Levels
         Heights from which points count as canopy: of its body for the centre line and the ends, of its ridge for the
         contrast, and for the centre line where canopies don't stand apart whole.
-    dtm : Raster
-        Terrain, which gives curves their elevation.
+    dtm, seen, within
+        As for :func:`vinemap.rows.ends.lay_out`, which tells what is returned.
     high : float
         Height in metres up to which they do.
     smoothing : float
@@ -113,13 +114,6 @@ def fit_rows(
         Share of the cover thereabouts at which a row's canopy begins and ends.
     min_gap : float
         Metres without canopy that make a gap.
-
-    Returns
-    -------
-    rows, gaps : GeoDataFrame
-        LineStringZ with ``spacing_m``, ``gap_m``, ``support`` (share of the length with canopy) and ``contrast``
-        (of the canopy to the ground beside it, 0–1); LineStringZ with ``row`` (position in rows), ``start_m``,
-        ``end_m``, ``length_m`` along γ.
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     curtains = courses["curtains_m"].to_numpy()
@@ -135,22 +129,12 @@ def fit_rows(
             break
         members = np.array(list(unended))
         curves = [_smooth_course(curve) for curve in unended.values()]
-    rows: list[tuple[object, ...]] = []
-    gaps: list[tuple[object, ...]] = []
-    for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True)):
-        fit = fits[k]
-        if fit is None or (alone and fit.contrast < LEAST_CONTRAST):
-            continue
-        empty = np.column_stack([fit.runs[:-1, 1], fit.runs[1:, 0]])
-        support = 1 - np.diff(empty, axis=1).sum() / fit.runs[-1, 1]
-        empty = empty[np.diff(empty, axis=1)[:, 0] >= min_gap]
-        gaps += [(len(rows), a, b, b - a, _line(between(fit.curve, a, b), dtm)) for a, b in empty]
-        line = _line(resample(fit.curve, VERTEX), dtm)
-        rows.append((spacing, float(np.diff(empty, axis=1).sum()), float(support), fit.contrast, line))
-    return (
-        _frame(rows, ["spacing_m", "gap_m", "support", "contrast"], cover),
-        _frame(gaps, ["row", "start_m", "end_m", "length_m"], cover),
-    )
+    standing = [
+        (spacing, fit)
+        for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True))
+        if (fit := fits[k]) and not (alone and fit.contrast < LEAST_CONTRAST)
+    ]
+    return lay_out(standing, seen, dtm, within=within, min_gap=min_gap)
 
 
 def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
@@ -337,12 +321,3 @@ def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int
                     everything[i + a, j + b] += part
                     leaves[i + a, j + b] += part * canopy[p]
     return leaves, everything
-
-
-def _line(curve: Values, dtm: Raster) -> shapely.LineString:
-    return shapely.LineString(np.column_stack([curve, sample(dtm, curve)]))
-
-
-def _frame(records: Sequence[tuple[object, ...]], columns: list[str], cover: Raster) -> gpd.GeoDataFrame:
-    data = {name: [r[k] for r in records] for k, name in enumerate(columns)}
-    return gpd.GeoDataFrame(data, geometry=[r[-1] for r in records], crs=cover.crs)

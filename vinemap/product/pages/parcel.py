@@ -44,7 +44,7 @@ TABLE = {
     **{f"{end}_{axis}": 2 for end in ("e1", "en") for axis in "xyz"},
     **{f"{end}_{axis}": digits for end in ("e1", "en") for axis, digits in (("lat", 8), ("lon", 8), ("alt", 2))},
     **dict.fromkeys(("spacing_m", "height_m", "bottom_m", "width_m"), 3),
-    **dict.fromkeys(("volume_m3", "gap_m"), 2),
+    **dict.fromkeys(("volume_m3", "gap_m", "unseen_m"), 2),
     "n_missing": 0,
     "block": 0,
     **dict.fromkeys(("support", "confidence", "canopy_confidence"), 3),
@@ -105,7 +105,8 @@ def parcel_page(
             **{name: np.round(rows[name].to_numpy(dtype=float), digits) for name, digits in TABLE.items()},
             "line": polylines(rows.geometry, zero, tolerance=TOLERANCE),
         },
-        "gaps": {name: np.round(gaps[name], 2).to_numpy() for name in ("row_id", "start_m", "end_m", "n_missing")},
+        "gaps": {name: np.round(gaps[name], 2).to_numpy() for name in ("row_id", "start_m", "end_m", "n_missing")}
+        | {"state": gaps["state"].tolist()},
         "unmapped": {
             "reason": unmapped["reason"].tolist(),
             **{name: np.round(unmapped[name].to_numpy(), digits) for name, digits in UNMAPPED.items()},
@@ -134,7 +135,7 @@ def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]
         "spacing_m": float(rows["spacing_m"].mean()) if len(rows) > 1 else np.nan,
         "volume_m3": float(rows["volume_m3"].sum()),
         "n_missing": int(rows["n_missing"].sum()),
-        "gap_m": float(rows["gap_m"].sum()),
+        **{name: float(rows[name].sum()) for name in ("gap_m", "unseen_m")},
         **means,
     }
 

@@ -9,6 +9,7 @@ import pandas as pd
 
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.product.qgis.symbology import (
+    by_value,
     categorised,
     classes_of,
     graduated,
@@ -21,6 +22,8 @@ from vinemap.product.qgis.symbology import (
     rgba,
     single,
 )
+from vinemap.rows.ends import MISSING
+from vinemap.rows.ends import UNSEEN as NOT_SEEN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,6 +44,9 @@ WORDS = {
     "canopy_confidence": "Confidence in the canopy's numbers",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
+    "unseen_m": "Length that was not seen (m)",
+    "state": "Vines missing, or not seen",
+    "beyond": "What is beyond that end",
     "share": "Share of the parcel",
     "rows_length_m": "Length of all rows (m)",
     "bottom_m": "Bottom of the foliage (m)",
@@ -66,7 +72,7 @@ WORDS = {
 }
 END_UNITS = {"x": "m", "y": "m", "z": "m", "lat": "°", "lon": "°", "alt": "m"}
 
-INK, PAPER, RED, TRACK = "#1d2b24", "#ffffff", "#d7263d", "#1b6ca8"
+INK, PAPER, RED, TRACK, GREY = "#1d2b24", "#ffffff", "#d7263d", "#1b6ca8", "#8b8f96"
 VIGOUR = ("#f7f06d", "#c2e06b", "#7cc96a", "#36a463", "#10775a", "#064b4a")
 """From little to much foliage, told apart by lightness alone as well."""
 TERRAIN = ("#3b5f4c", "#6c8c5a", "#a9b87a", "#dccfa0", "#c69f74", "#9a6b50", "#f4efe9")
@@ -80,11 +86,11 @@ REASONS = {UNSEEN: "#c2185b", ALONE: "#ef6fa5", LOW: "#f0a202", WIDE: "#96582a",
 LOWEST_CANOPY, HIGHEST_CANOPY = 0.5, 2.5
 """Metres between which the canopies' height has its colours, the same in all parcels and surveys."""
 
-VOLUME_PER_METRE = 'coalesce("volume_m3" / "length_m", 0)'
+VOLUME_PER_METRE = 'coalesce("volume_m3" / ("length_m" - "unseen_m"), 0)'
 CASING = {"line_color": rgba("#1d2b24c8"), "line_width": "1.3", "capstyle": "flat"}
 SYMBOLS = {
     "rows": ("line", [CASING, {"line_width": "0.9", "capstyle": "flat"}]),
-    "gaps": ("line", [{"line_color": rgba(RED), "line_width": "1.9", "capstyle": "flat"}]),
+    "gaps": ("line", [{"line_width": "1.9", "capstyle": "flat"}]),
     "sections": ("line", [{"line_width": "0.4", "capstyle": "flat"}]),
     "row_ends": ("marker", [{"color": rgba(PAPER), "outline_color": rgba(INK), "outline_width": "0.3", "size": "1.6"}]),
     "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
@@ -96,20 +102,23 @@ SYMBOLS = {
         [{"style": "no", "outline_color": rgba("#5b3f8c"), "outline_width": "0.6", "outline_style": "dash"}],
     ),
 }
+GAPS = {MISSING: {"line_color": rgba(RED)}, NOT_SEEN: {"line_color": rgba(GREY)}}
 FLAGGED = "if(\"flag\" = '', 0, 1)"
 MEASURED_OR_NOT = [(-0.5, 0.5, "measured", TRACK), (0.5, 1.5, "flagged", RED)]
 SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000, "poses": 500}
 """Layers of small things show from this scale denominator on."""
 LABEL_SCALE = 4000
 MAP_TIPS = {
-    "rows": "<b>Row [% label %]</b><br>[% round(length_m, 1) %] m, [% round(volume_m3 / length_m, 2) %] m³/m<br>"
-    "[% round(height_m, 2) %] m high, [% round(width_m, 2) %] m wide<br>missing vines: [% n_missing %]"
+    "rows": "<b>Row [% label %]</b><br>[% round(length_m, 1) %] m, [% round(volume_m3 / (length_m - unseen_m), 2) %] "
+    "m³/m<br>[% round(height_m, 2) %] m high, [% round(width_m, 2) %] m wide<br>missing vines: [% n_missing %]"
+    "[% if(unseen_m > 0, '<br>not seen: ' || round(unseen_m, 1) || ' m', '') %]"
     "<br>confidence: [% round(confidence, 2) %] in the row[% if(canopy_confidence is null, '', ', ' || "
     "round(canopy_confidence, 2) || ' in its canopy') %][% if(flags = '', '', '<br>' || flags) %]",
-    "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, missing vines: [% n_missing %]",
+    "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, "
+    "[% if(state = 'unseen', 'not seen', 'missing vines: ' || n_missing) %]",
     "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
     "[% round(width_m, 2) %] m wide",
-    "row_ends": "<b>Row [% label %]</b>, end [% end %]",
+    "row_ends": "<b>Row [% label %]</b>, end [% end %][% if(beyond = 'seen', '', '<br>it may go on: ' || beyond) %]",
     "unmapped": "<b>In no row: [% reason %]</b><br>[% round(area_m2) %] m², [% round(height_m, 1) %] m high, "
     "closed over [% round(width_m, 1) %] m",
     "track": "<b>Stretch [% stretch %]</b><br>[% round(length_m, 2) %] m, [% n_poses %] poses",
@@ -174,13 +183,16 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
     """
     symbol = SYMBOLS[layer]
     if layer == "rows":
-        volume = (table["volume_m3"] / table["length_m"]).to_numpy()
+        volume = (table["volume_m3"] / (table["length_m"] - table["unseen_m"])).to_numpy()
         renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
     elif layer == "sections":
         renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
     elif layer == "unmapped":
         there = {reason: shade for reason, shade in REASONS.items() if (table["reason"] == reason).any()}
         renderer = categorised("reason", there or REASONS, symbol)
+    elif layer == "gaps":
+        states = {state: own for state, own in GAPS.items() if state == MISSING or (table["state"] == state).any()}
+        renderer = by_value("state", states, symbol)
     elif layer == "poses":
         renderer = graduated(FLAGGED, MEASURED_OR_NOT, symbol)
     else:

@@ -75,11 +75,18 @@ def graduated(expression: str, classes: Sequence[Class], symbol: Symbol) -> Elem
 
 def categorised(column: str, colours: Mapping[str, str], symbol: Symbol) -> Element:
     """A fill whose last layer has the colour of a column's value, see-through but for its edge."""
+    shades = {value: {"color": rgba(f"{shade}70"), "outline_color": rgba(shade)} for value, shade in colours.items()}
+    return by_value(column, shades, symbol)
+
+
+def by_value(column: str, properties: Mapping[str, Mapping[str, str]], symbol: Symbol) -> Element:
+    """A symbol whose last layer has further properties by a column's value."""
     kind, layers = symbol
-    shades = [{"color": rgba(f"{shade}70"), "outline_color": rgba(shade)} for shade in colours.values()]
-    symbols = [_symbol(str(k), (kind, [*layers[:-1], layers[-1] | own])) for k, own in enumerate(shades)]
+    symbols = [
+        _symbol(str(k), (kind, [*layers[:-1], layers[-1] | dict(own)])) for k, own in enumerate(properties.values())
+    ]
     categories = [
-        node("category", value=value, label=value, symbol=k, render="true") for k, value in enumerate(colours)
+        node("category", value=value, label=value, symbol=k, render="true") for k, value in enumerate(properties)
     ]
     return node(
         "renderer-v2",

@@ -52,9 +52,11 @@ export function showMap(rows, profiles, selected) {
   const canvas = new Canvas({ pane: "pieces", padding: 0.5 });
   const svg = new SVG({ pane: "hits", padding: 0.5 });
   const drawn = new LayerGroup().addTo(map);
-  const gaps = rows.flatMap((row) => row.gaps.map((gap) => new Polyline(piece(row.line, gap.start, gap.end).map(place), {
+  const stretches = (name) => rows.flatMap((row) => row[name].map(({ start, end }) => new Polyline(piece(row.line, start, end).map(place), {
     renderer: canvas, interactive: false, lineCap: "butt",
   })));
+  const gaps = stretches("gaps");
+  const unseen = stretches("unseen");
   const halo = new Polyline([], { renderer: under, interactive: false, opacity: 0.9 }).addTo(map);
   const here = new CircleMarker([0, 0], { renderer: svg, radius: 5, weight: 2, fillOpacity: 1, interactive: false });
 
@@ -80,7 +82,7 @@ export function showMap(rows, profiles, selected) {
     });
     const weight = Math.min(8, Math.max(2.5, 0.4 * scale));
     drawn.eachLayer((layer) => layer.setStyle({ weight }));
-    gaps.forEach((layer) => layer.setStyle({ weight }));
+    [...gaps, ...unseen].forEach((layer) => layer.setStyle({ weight }));
     halo.setStyle({ weight: weight + 5 });
   }
 
@@ -102,7 +104,9 @@ export function showMap(rows, profiles, selected) {
     for (const { value, line } of parts) {
       new Polyline(line.map(place), { renderer: canvas, interactive: false, lineCap: "butt", color: shade(chosen.value === "gaps" ? span[1] - value : value, chosen.value === "gaps" ? [0, span[1]] : span) }).addTo(drawn);
     }
-    gaps.forEach((gap) => { gap.remove(); gap.setStyle({ color: colour("gap") }).addTo(map); });
+    for (const [lines, name] of [[gaps, "gap"], [unseen, "soft"]]) {
+      lines.forEach((line) => { line.remove(); line.setStyle({ color: colour(name) }).addTo(map); });
+    }
     legend(quantity, span);
     thin();
   }
@@ -116,6 +120,7 @@ export function showMap(rows, profiles, selected) {
       quantity && element("span", {}, `${quantity.title}, ${quantity.unit}`),
       quantity && element("span", { class: "key" }, number(low, quantity.digits), bar, number(high, quantity.digits)),
       quantity && element("span", { class: "key" }, element("span", { class: "dash" }), "gap"),
+      unseen.length ? element("span", { class: "key" }, element("span", { class: "dash dark" }), "not seen") : null,
       unmapped.length ? element("span", { class: "key" }, element("span", { class: "patch" }), "in no row") : null,
       element("span", { class: "key" }, "heights 0", ink, `${number(tallest)} m`),
     ].filter(Boolean));
@@ -152,6 +157,7 @@ function hint(row) {
     ["Length", `${number(row.length_m, 1)} m`], ["Height", `${number(row.height_m, 2)} m`], ["Width", `${number(row.width_m, 2)} m`],
     ["Volume", `${number(row.volume_m3, 1)} m³, ${number(row.volume_m, 2)} a metre`],
     ["Gaps", `${number(row.gap_m, 1)} m, ${number(row.n_missing)} missing`],
+    ...(row.unseen_m ? [["Not seen", `${number(row.unseen_m, 1)} m`]] : []),
   ]);
 }
 

@@ -86,10 +86,12 @@ export function showPlots(rows, profiles, step, mark) {
 function shadeGaps(plot, row) {
   const { ctx, bbox } = plot;
   ctx.save();
-  ctx.fillStyle = colour("gap-tint");
-  for (const { start, end } of row.gaps) {
-    const [from, to] = [start, end].map((position) => plot.valToPos(position, "x", true));
-    ctx.fillRect(from, bbox.top, to - from, bbox.height);
+  for (const [stretches, name] of [[row.gaps, "gap-tint"], [row.unseen, "grid"]]) {
+    ctx.fillStyle = colour(name);
+    for (const { start, end } of stretches) {
+      const [from, to] = [start, end].map((position) => plot.valToPos(position, "x", true));
+      ctx.fillRect(from, bbox.top, to - from, bbox.height);
+    }
   }
   ctx.restore();
 }

@@ -11,10 +11,12 @@ import { rowTable } from "./rows.js";
 const rows = data.rows.row_id.map((id, k) => {
   const row = Object.fromEntries(Object.entries(data.rows).map(([name, values]) => [name, values[k]]));
   const own = data.gaps.row_id.map((of, g) => (of === id ? g : -1)).filter((g) => g >= 0);
-  row.gaps = own.map((g) => ({ start: data.gaps.start_m[g], end: data.gaps.end_m[g], missing: data.gaps.n_missing[g] }));
+  const gaps = own.map((g) => ({ start: data.gaps.start_m[g], end: data.gaps.end_m[g], unseen: data.gaps.state[g] === "unseen" }));
+  row.gaps = gaps.filter(({ unseen }) => !unseen);
+  row.unseen = gaps.filter(({ unseen }) => unseen);
   row.line = measured(row.line);
-  row.volume_m = row.volume_m3 / row.length_m;
-  row.gap_share = row.gap_m / row.length_m;
+  row.volume_m = row.volume_m3 / (row.length_m - row.unseen_m);
+  row.gap_share = row.gap_m / (row.length_m - row.unseen_m);
   return row;
 });
 const selected = choice();
@@ -50,6 +52,7 @@ async function start() {
     at("facts").textContent = [
       `${number(row.length_m, 1)} m long`, `${number(row.volume_m, 2)} m³ of canopy a metre`,
       row.gaps.length ? `${row.gaps.length} gap${row.gaps.length > 1 ? "s" : ""} of ${number(row.gap_m, 1)} m, ${number(row.n_missing)} vine${row.n_missing === 1 ? "" : "s"} missing` : "no gap",
+      row.unseen_m ? `${number(row.unseen_m, 1)} m not seen` : "",
       row.flags ? `odd: ${row.flags}` : "",
     ].filter(Boolean).join(" · ");
   });

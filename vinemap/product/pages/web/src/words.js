@@ -4,7 +4,7 @@ import { at, day, element, facts, number, plural } from "./page.js";
 export function showHead({ parcel, survey, flown, warnings, totals, vinemap }) {
   at("over").textContent = ["Vine rows", survey && `survey ${survey}`, flown && `flown ${day(flown)}`].filter(Boolean).join(" · ");
   at("title").textContent = parcel;
-  const share = totals.length_m ? `${number((100 * totals.gap_m) / totals.length_m, 1)}% of the length` : "";
+  const share = totals.length_m ? `${number((100 * totals.gap_m) / (totals.length_m - totals.unseen_m), 1)}% of the length` : "";
   const ha = totals.area_m2 / 1e4;
   facts(at("figures"), [
     ["Rows", number(totals.rows)],
@@ -15,6 +15,7 @@ export function showHead({ parcel, survey, flown, warnings, totals, vinemap }) {
     ["Mean height", number(totals.height_m, 2), "m", totals.width_m ? `${number(totals.width_m, 2)} m wide` : ""],
     ["Missing vines", number(totals.n_missing)],
     ["Gaps", number(totals.gap_m, 1), "m", share],
+    ...(totals.unseen_m ? [["Not seen", number(totals.unseen_m, 1), "m", "of the rows"]] : []),
   ]);
   at("notices").append(
     warnings?.length
