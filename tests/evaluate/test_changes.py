@@ -98,3 +98,20 @@ def test_few_or_no_rows(later, earlier):
     assert changes.shift == pytest.approx((0, 0), abs=1e-6)
     found = summarise(changes)
     assert (found["same"], found["new"] + found["gone"]) == (min(later, earlier), abs(later - earlier))
+
+
+def test_what_was_not_seen_on_one_date_is_no_change():
+    before, lines = {"unseen_m": [0.0, 2.0, 0.0]}, rows_of(3, length=40)
+    now = table(lines, height_m=2.0, gap_m=3.0, n_missing=3, volume_m3=[44.0, 50, 40], unseen_m=[0.0, 0, 4])
+    changes = compare_rows(now, table(lines, **before))
+    for name, gained in (("d_gap_m", 2), ("d_n_missing", 2), ("d_volume_m3", 4)):
+        assert changes.rows[name].to_numpy() == pytest.approx([gained, np.nan, np.nan], nan_ok=True)
+        assert summarise(changes)[name] == gained
+    assert changes.rows["n_missing"].tolist() == [3, 3, 3]
+    assert changes.rows["d_height_m"].to_numpy() == pytest.approx(0.1)
+    assert summarise(changes)["d_volume"] == pytest.approx(0.1)
+    without = now.drop(columns="unseen_m")
+    assert compare_rows(without, table(lines, **before)).rows["d_gap_m"].isna().tolist() == [False, True, False]
+    assert compare_rows(without, table(lines)).rows["d_gap_m"].notna().all()
+    none = summarise(compare_rows(now.assign(unseen_m=1.0), table(lines)))
+    assert np.isnan([none[name] for name in ("d_gap_m", "d_n_missing", "d_volume")]).all()

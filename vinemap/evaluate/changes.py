@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MEASURES = ("length_m", "height_m", "width_m", "volume_m3", "gap_m", "n_missing")
 """Numbers of rows that are compared."""
+SUMS = ("volume_m3", "gap_m", "n_missing")
+"""Those that are less where less of a row was seen."""
 SAME, NEW, GONE = "same", "new", "gone"
 NONE = -1
 """Position of no row."""
@@ -47,7 +49,8 @@ class Changes(NamedTuple):
     rows: pd.DataFrame
     """A line a row of the later date, then those that are gone: ``state`` ("same", "new", "gone"), ``label`` and
     ``earlier`` (its label at that date), ``part_of`` (label of the other date's row that it was split from or joined
-    to), its numbers, ``length_m`` and so on, and what one that is the same has gained, ``d_length_m`` and so on."""
+    to), its numbers, ``length_m`` and so on, and what one that is the same has gained, ``d_length_m`` and so on. What
+    it has gained in volume, gaps and missing vines isn't known, NaN, where a part of it wasn't seen on either date."""
 
 
 def compare_rows(
@@ -58,7 +61,7 @@ def compare_rows(
     Parameters
     ----------
     later, earlier : GeoDataFrame
-        Layer ``rows`` of the two products, each in any projected CRS in metres.
+        Layer ``rows`` of the two products, each in any projected CRS in metres; without ``unseen_m`` all was seen.
     overlap : float
         Share of the longer row along which two must run beside each other to be the same.
     width : float
@@ -85,12 +88,12 @@ def compare_rows(
     part_of[state == NEW] = labels_before[_part_of(moved[is_now[state == NEW]], before, near)]
     part_of[state == GONE] = labels[_part_of(before[lost], moved, near)]
     columns = {"state": state, "label": labels[is_now], "earlier": labels_before[was], "part_of": part_of}
+    pairs = (later, is_now), (earlier, was)
+    hidden = np.any([_column(table, "unseen_m", places) > 0 for table, places in pairs if "unseen_m" in table], axis=0)
     for name in MEASURES:
-        now, then = (
-            np.append(table[name].to_numpy(dtype=float), np.nan)[places]
-            for table, places in ((later, is_now), (earlier, was))
-        )
-        columns |= {name: np.where(state == GONE, then, now), f"d_{name}": now - then}
+        now, then = (_column(table, name, places) for table, places in pairs)
+        gained = np.where(hidden, np.nan, now - then) if name in SUMS else now - then
+        columns |= {name: np.where(state == GONE, then, now), f"d_{name}": gained}
     return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), pd.DataFrame(columns))
 
 
@@ -125,7 +128,8 @@ def summarise(changes: Changes) -> dict[str, float]:
     -------
     dict
         ``same``, ``new`` and ``gone`` (numbers of rows), ``d_height_m``, ``d_width_m``, ``d_volume_m3``,
-        ``d_volume`` (share of what was), ``d_gap_m`` and ``d_n_missing``; NaN where no row is the same.
+        ``d_volume`` (share of what was), ``d_gap_m`` and ``d_n_missing``; NaN where no row is the same, or none of
+        which it is known.
     """
     state = changes.rows["state"].to_numpy()
     found: dict[str, float] = {one: int((state == one).sum()) for one in (SAME, NEW, GONE)}
@@ -134,10 +138,16 @@ def summarise(changes: Changes) -> dict[str, float]:
     for name in ("d_height_m", "d_width_m"):
         known = np.isfinite(same[name])
         found[name] = float(np.average(same[name][known], weights=same["length_m"][known])) if known.any() else np.nan
-    for name in ("d_volume_m3", "d_gap_m", "d_n_missing"):
-        found[name] = float(same[name].sum()) if len(same[name]) else np.nan
-    before = (same["volume_m3"] - same["d_volume_m3"]).sum()
+    for name in (f"d_{one}" for one in SUMS):
+        found[name] = float(np.nansum(same[name])) if np.isfinite(same[name]).any() else np.nan
+    before = np.nansum(same["volume_m3"] - same["d_volume_m3"])
     return found | {"d_volume": found["d_volume_m3"] / before if before > 0 else np.nan}
+
+
+def _column(table: gpd.GeoDataFrame, name: str, places: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Numbers of a table's rows in some places, NaN where that is none."""
+    out: NDArray[np.float64] = np.append(table[name].to_numpy(dtype=float), np.nan)[places]
+    return out
 
 
 def _spacing(*tables: gpd.GeoDataFrame) -> float:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
-"""What is read of rows."""
+"""What is read of rows, beside what wasn't seen of them."""
 TOLERANCE = 0.2
 """Metres by which lines on the map may leave rows and outlines."""
 SHARED = 0.3
@@ -280,7 +280,7 @@ def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
     """Rows of a product, or None if they can't be read."""
     path = paths.geopackage(folder, parcel)
     try:
-        rows = pyogrio.read_dataframe(path, layer="rows", columns=list(COLUMNS))
+        rows = pyogrio.read_dataframe(path, layer="rows", columns=[*COLUMNS, "unseen_m"])
         rows = rows.astype(dict.fromkeys(("spacing_m", *MEASURES), float))
         usable = set(COLUMNS) <= set(rows.columns) and rows.crs is not None
         lines = rows[(rows.geom_type == "LineString") & (rows.length > 0)] if usable else None
