@@ -1,11 +1,17 @@
 """Lanes between rows drawn by hand, in metres from where they must be."""
 
+import json
+
 import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
 
+from vinemap.export.field import Field
 from vinemap.export.lanes import lanes_between, resampled
+from vinemap.export.nav2 import write_nav2
+from vinemap.geo.crs import Corner
+from vinemap.geo.holes import comes_back
 
 
 def field(*lines, spacing=2.5, block=1, **columns):
@@ -185,3 +191,88 @@ def test_so_many_vertices_at_equal_distances():
         assert step == pytest.approx(np.full(16, step.mean()), rel=0.005)
     (line,) = resampled([shapely.LineString([[0, 0, 1], [3, 0, 4], [4, 0, 4]])], 5)
     assert np.array(line.coords) == pytest.approx(np.array([[0, 0, 1], [1, 0, 2], [2, 0, 3], [3, 0, 4], [4, 0, 4]]))
+
+
+AROUND = shapely.box(-1, -2, 61, 12)
+"""A parcel of five rows of 60 m, 2.5 m apart, about as tight as people draw them."""
+POND = shapely.Point(30, 5).buffer(4)
+"""A hole in it: of the row at 5 m, 8 m are left out, of those beside it 6.2 m."""
+NOTCH = shapely.box(26, 6, 34, 20)
+
+
+def rows_outside(shape):
+    """The five rows, where they are outside of a shape."""
+    whole = shapely.union_all([shapely.LineString(row(0, 60, 2.5 * k)[:, :2]) for k in range(5)])
+    parts = sorted(
+        shapely.get_parts(shapely.line_merge(whole.difference(shape))), key=lambda g: (g.bounds[1], g.bounds[0])
+    )
+    return field(*(row(part.bounds[0], part.bounds[2], part.bounds[1]) for part in parts))
+
+
+@pytest.mark.parametrize(
+    ("shape", "told"),
+    [
+        (POND, ["1-2", "1-3", "2-4", "3-5", "4-6", "5-7", "6-8", "7-8"]),
+        (NOTCH, ["1-2", "2-3", "3-4", "3-5", "4-6", "5-7"]),
+        (shapely.box(29, 3, 31, 4.5), ["1-2", "2-3 a", "2-3 b", "3-4", "4-5"]),
+        (shapely.box(20, 1.5, 23, 3.5).union(shapely.box(40, -5, 43, 8.4)), None),
+    ],
+)
+@pytest.mark.parametrize("outer", [False, True])
+def test_no_lane_leads_through_a_hole_or_a_notch(shape, told, outer):
+    rows, parcel = rows_outside(shape), AROUND.difference(shape)
+    free = lanes_between(rows, headland=3, outer=outer)
+    assert free.intersects(shape).any()
+    lanes = lanes_between(rows, parcel, headland=3, outer=outer)
+    assert lanes.intersection(shape).length.max() == pytest.approx(0, abs=1e-6)
+    if told and not outer:
+        assert labels(lanes) == told
+    # As long as they can be: beyond the parcel's outer sides they have their headland, before the hole none is lost.
+    covered = shapely.union_all(shapely.buffer(lanes.geometry, 0.3))
+    lost = free.difference(shapely.buffer(shape, 0.8)).difference(covered)
+    assert lost.length.max() == pytest.approx(0, abs=0.01)
+    assert lanes.total_bounds[[0, 2]] == pytest.approx([-3, 63])
+    assert lanes["lane_id"].tolist() == list(range(1, len(lanes) + 1))
+    assert lanes["label"].is_unique
+
+
+def test_a_tight_parcel_takes_nothing_of_lanes_where_its_headland_slants():
+    rows = field(*(row(1.5 * k, 60 + 2.5 * k, 2.5 * k) for k in range(6)))
+    around = shapely.Polygon([(-0.7, -0.5), (60, -0.5), (73, 13), (7.8, 13)])
+    assert around.covers(shapely.union_all(rows.geometry))
+    free, lanes = (lanes_between(rows, within, headland=3) for within in (None, around))
+    assert not around.covers(shapely.union_all(lanes_between(rows, headland=0).geometry))
+    assert shapely.equals_exact(lanes.geometry.to_numpy(), free.geometry.to_numpy(), 1e-9).all()
+
+
+def test_beside_a_row_that_goes_on_alone_a_lane_keeps_within_the_parcel():
+    rows, corner = field(row(0, 60, 0), row(0, 30, 2.5), row(0, 30, 5)), shapely.box(31, 0.6, 61, 9)
+    (lane, _) = lanes_between(rows, shapely.box(-1, -2, 61, 6).difference(corner), headland=3).geometry
+    assert lane.intersection(corner).length < 3
+    assert lane.bounds[2] == pytest.approx(34, abs=0.6)
+    assert lanes_between(rows, headland=3).geometry[0].bounds[2] == pytest.approx(63)
+
+
+def test_what_comes_back():
+    ways = {
+        True: [[(20, 5), (40, 5)], [(-5, 5), (40, 5)], [(26, 5), (27, 8.5)]],
+        False: [[(0, 0), (60, 0)], [(-5, 5), (25, 5)], [(28, 5), (31, 5)], [(-5, -9), (70, -9)]],
+    }
+    for back, lines in ways.items():
+        drawn = np.array([shapely.LineString(line) for line in lines])
+        assert (comes_back(drawn, AROUND.difference(POND)) == back).all()
+
+
+def test_robots_go_round_a_hole(tmp_path):
+    rows, parcel = rows_outside(POND), AROUND.difference(POND)
+    outline = gpd.GeoDataFrame({"parcel": ["A"]}, geometry=[parcel], crs=rows.crs)
+    rest = {"folder": tmp_path, "parcel": "A", "survey": "A", "flown": "2026-06-01", "key": "", "outline": outline}
+    lanes = lanes_between(rows, parcel, headland=3)
+    field_of = Field(**rest, origin=Corner(0, 0, 0), rows=rows, lanes=lanes, row_ends=rows, gaps=rows, bounded=True)
+    through = []
+    for one in (field_of, field_of._replace(bounded=False)):
+        write_nav2(one, tmp_path, frame="map", grid=True)
+        features = json.loads((tmp_path / "A_graph.geojson").read_text())["features"]
+        ways = [shapely.LineString(f["geometry"]["coordinates"][0]) for f in features if "cost" in f["properties"]]
+        through.append(sum(way.intersection(POND).length > 0.1 for way in ways))
+    assert through[0] == 0 < through[1]

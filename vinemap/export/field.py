@@ -42,6 +42,8 @@ class Field(NamedTuple):
     gaps: gpd.GeoDataFrame
     outline: gpd.GeoDataFrame
     """Layer ``parcel`` of the product."""
+    bounded: bool
+    """Whether that is a polygon that was given, and not one about the rows."""
 
     def wgs84(self, layer: str) -> gpd.GeoDataFrame:
         """One of the layers in longitude and latitude, to a tenth of a millimetre; heights stay, to a millimetre.
@@ -117,12 +119,16 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     rows = layers["rows"].sort_values("row_id", ignore_index=True)
     if len(rows) == 0:
         raise InputError(f"{paths.shown(path)}: has no row to export")
-    lanes = lanes_between(rows if lines != "rows" else rows[:0], headland=headland, outer=outer, vertices=vertices)
+    bounded = bool(record.get("bounded"))
+    within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None
+    drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
+    lanes = lanes_between(rows if lines != "rows" else rows[:0], within, **drawn)
     if lines != "rows" and len(lanes) == 0:
         raise InputError(
             f"{paths.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"
         )
-    known = {
+    known: dict[str, Any] = {
+        "bounded": bounded,
         "survey": str(record.get("survey") or parcel),
         "flown": str(record.get("flown") or "2000-01-01")[:10],
         "key": str(record.get("key")),

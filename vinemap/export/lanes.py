@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import geopandas as gpd
@@ -10,13 +11,14 @@ import shapely
 
 from vinemap.export.neighbours import STEP, aligned, belonging, look, pair_rows
 from vinemap.geo.curve import extend, way_along
+from vinemap.geo.holes import across, comes_back, room_before
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from vinemap.compute.arrays import Floats
+    from vinemap.compute.arrays import Flags, Floats
     from vinemap.export.neighbours import Pair, Side
 
 TANGENT = 2.0
@@ -29,6 +31,8 @@ OPENING = 0.1
 """Metres across per metre along by which a lane goes away from a row that is alone, up to its usual width."""
 PLAN_TOLERANCE, HEIGHT_TOLERANCE = 0.01, 0.03
 """Metres by which a lane may leave its course once vertices are left out."""
+BESIDE = 1.5
+"""Half widths of a lane within which the rows are that it runs beside."""
 
 
 class _Course(NamedTuple):
@@ -39,7 +43,12 @@ class _Course(NamedTuple):
 
 
 def lanes_between(
-    rows: gpd.GeoDataFrame, *, headland: float = 3.0, outer: bool = False, vertices: int | None = None
+    rows: gpd.GeoDataFrame,
+    within: shapely.Geometry | None = None,
+    *,
+    headland: float = 3.0,
+    outer: bool = False,
+    vertices: int | None = None,
 ) -> gpd.GeoDataFrame:
     """Draw the lane between each two neighbouring rows of a block.
 
@@ -56,9 +65,11 @@ def lanes_between(
     ----------
     rows : GeoDataFrame
         LineStringZ with ``row_id``, ``block``, ``spacing_m``, and the canopy's ``width_m`` if it is known.
+    within : Geometry, optional
+        The parcel's polygon, where it is known: no lane leads through a hole or a notch of it.
     headland : float
         Metres by which lanes run straight on beyond their rows, so that a machine is clear of them as it turns; fewer
-        where another row stands in the way.
+        where another row, or a hole or notch of the parcel, is in the way.
     outer : bool
         Whether there is a lane half a spacing beside the first row of a block and its last, too.
     vertices : int, optional
@@ -67,10 +78,11 @@ def lanes_between(
     Returns
     -------
     GeoDataFrame
-        LineStringZ with ``lane_id`` (1 … n, in order of the rows), ``label`` ("3-4", "3-4+5" beside a parted row),
-        ``block``, ``right_rows`` and ``left_rows`` (their ``row_id``, "4+5", empty beside none), ``length_m`` (in plan,
-        headlands included), ``width_m`` (mean distance of the rows), ``narrowest_m`` and ``clear_m`` (mean distance of
-        the canopies). Lanes run as the rows do, from e1 to en; z is the mean of the two rows'.
+        LineStringZ with ``lane_id`` (1 … n, in order of the rows), ``label`` ("3-4", "3-4+5" beside a parted row, "3-4
+        a" and "3-4 b" of a lane in parts), ``block``, ``right_rows`` and ``left_rows`` (their ``row_id``, "4+5", empty
+        beside none), ``length_m`` (in plan, headlands included), ``width_m`` (mean distance of the rows),
+        ``narrowest_m`` and ``clear_m`` (mean distance of the canopies). Lanes run as the rows do, from e1 to en; z is
+        the mean of the two rows'.
     """
     curves = aligned(rows)
     tree = shapely.STRtree([shapely.LineString(curve[:, :2]) for curve in curves])
@@ -80,8 +92,11 @@ def lanes_between(
     courses = [(*_members(pairs), _course(*_members(pairs), sides, lanes, curves)) for pairs in _groups(lanes)]
     if outer:
         courses += list(_beside(sides, lanes, spacing))
-    table = [_describe(right, left, course, rows, headland, tree) for right, left, course in courses]
+    if within is not None:
+        courses = [part for course in courses for part in _inside(*course, within, tree)]
+    table = [_describe(right, left, course, rows, headland, tree, within) for right, left, course in courses]
     order = sorted(range(len(table)), key=lambda k: _rank(courses[k][:2], rows))
+    _name_parts([table[k] for k in order])
     lines = [table[k].pop("line") for k in order]
     lines = list(resampled(lines, vertices)) if vertices else lines
     columns = ("label", "block", "right_rows", "left_rows", "length_m", "width_m", "narrowest_m", "clear_m")
@@ -185,8 +200,69 @@ def _beside(
             yield ([i], [], _Course(xyz, half)) if sign > 0 else ([], [i], _Course(xyz, half))
 
 
+def _inside(
+    right: list[int], left: list[int], course: _Course, within: shapely.Geometry, tree: shapely.STRtree
+) -> Iterator[tuple[list[int], list[int], _Course]]:
+    """A lane in the parts that are in a polygon, or beside it and in no hole or notch.
+
+    Between two rows it may lead out of it at its ends for its width, as where rows end along a slanting headland.
+    """
+    xy, lines = course.xyz[:, :2], tree.geometries
+    half = course.half[np.isfinite(course.half)]
+    reach = float(half.max()) if len(half) else STEP
+    free = np.asarray(shapely.contains_xy(within, xy))
+    if right and left:
+        for way, inside in ((xy, free), (xy[::-1], free[::-1])):
+            _lead_out(way, inside, 2 * reach, within)
+    else:
+        row = lines[(right or left)[0]]
+        foot = shapely.get_coordinates(shapely.line_interpolate_point(row, shapely.line_locate_point(row, _points(xy))))
+        away = (xy - foot) / np.maximum(np.hypot(*(xy - foot).T), 1e-9)[:, None]
+        rays = np.asarray(shapely.linestrings(np.stack([foot, xy + across(within) * away], axis=1)), dtype=object)
+        free |= ~comes_back(rays, within)
+    if free.all():
+        yield right, left, course
+        return
+    for run in np.split(np.arange(len(xy)), np.flatnonzero(np.diff(free)) + 1):
+        if free[run[0]] and float(way_along(xy[run])[-1]) > reach:
+            line = shapely.LineString(xy[run])
+            near = [[i for i in group if shapely.dwithin(lines[i], line, BESIDE * reach)] for group in (right, left)]
+            yield near[0] or right, near[1] or left, _Course(course.xyz[run], course.half[run])
+
+
+def _lead_out(xy: Floats, free: Flags, longest: float, within: shapely.Geometry) -> None:
+    """Free the places (n,) at a lane's end that lie outside of a polygon, if it leads so far at the most, and away."""
+    last = int(np.flatnonzero(free).max(initial=-1))
+    beyond = xy[last:]
+    if last < 0 or len(beyond) < 2 or way_along(beyond)[-1] > longest:
+        return
+    outward = (beyond[-1] - beyond[0]) / np.hypot(*(beyond[-1] - beyond[0]))
+    line = shapely.LineString([*beyond, beyond[-1] + across(within) * outward])
+    free[last:] = not comes_back(np.array([line], dtype=object), within)[0]
+
+
+def _points(xy: Floats) -> NDArray[np.object_]:
+    return np.asarray(shapely.points(xy), dtype=object)
+
+
+def _name_parts(table: list[dict[str, Any]]) -> None:
+    """Tell parts of one lane apart by letters."""
+    often, so_far = Counter(lane["label"] for lane in table), Counter[str]()
+    for lane in table:
+        name = lane["label"]
+        if often[name] > 1:
+            lane["label"] = f"{name} {chr(ord('a') + so_far[name])}"
+            so_far[name] += 1
+
+
 def _describe(
-    right: list[int], left: list[int], course: _Course, rows: gpd.GeoDataFrame, headland: float, tree: shapely.STRtree
+    right: list[int],
+    left: list[int],
+    course: _Course,
+    rows: gpd.GeoDataFrame,
+    headland: float,
+    tree: shapely.STRtree,
+    within: shapely.Geometry | None,
 ) -> dict[str, Any]:
     """A lane with what is known of it."""
     ids = rows["row_id"].to_numpy()
@@ -197,7 +273,7 @@ def _describe(
     halves = [np.nanmean(canopy[group]) / 2 if np.isfinite(canopy[group]).any() else np.nan for group in (right, left)]
     taken = sum(half for half, group in zip(halves, (right, left), strict=True) if group)
     mean = float(width.mean()) if len(width) else float(rows["spacing_m"].iloc[(right or left)[0]])
-    line = _driven(course.xyz, headland, mean / 2, tree)
+    line = _driven(course.xyz, headland, mean / 2, tree, within)
     return {
         "label": "-".join(ordered) if len(ordered) == 2 else f"{'left' if right else 'right'} of {ordered[0]}",
         "block": rows["block"].iloc[(right or left)[0]],
@@ -211,8 +287,10 @@ def _describe(
     }
 
 
-def _driven(xyz: Floats, headland: float, clearance: float, tree: shapely.STRtree) -> shapely.LineString:
-    """A lane in few vertices, carried straight on at both ends, and nowhere across a row."""
+def _driven(
+    xyz: Floats, headland: float, clearance: float, tree: shapely.STRtree, within: shapely.Geometry | None
+) -> shapely.LineString:
+    """A lane in few vertices, carried straight on at both ends, and nowhere across a row, or a hole of a polygon."""
     line = shapely.LineString(xyz)
     crossed = tree.geometries[tree.query(line, predicate="intersects")]
     if len(crossed):
@@ -229,7 +307,8 @@ def _driven(xyz: Floats, headland: float, clearance: float, tree: shapely.STRtre
         free = np.min(
             shapely.distance(shapely.points(end[0, :2]), taken), initial=np.inf, where=~shapely.is_empty(taken)
         )
-        on = min(headland, float(free) - clearance / 2)
+        room = room_before(end[0, :2], outward[:2], within) if within else np.inf
+        on = min(headland, float(free) - clearance / 2, room)
         ends.append((end[0] + on * outward)[None] if on > 0 else end[:0])
     return _light(np.concatenate([ends[0], xyz, ends[1]]))
 

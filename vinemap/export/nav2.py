@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 
 from vinemap import paths
+from vinemap.geo.holes import comes_back
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,7 +40,7 @@ def write_nav2(field: Field, folder: Path, *, frame: str, grid: bool) -> None:
 
     The route server goes straight from node to node, whatever an edge's geometry, so curves are in the nodes. Ends are
     joined, start to start and end to end, where two lanes have a row in common and the way leads through none, as it
-    would without a headland; what lies between blocks isn't known.
+    would without a headland, nor through a hole or notch of the parcel; what lies between blocks isn't known.
 
     Parameters
     ----------
@@ -67,7 +68,8 @@ def write_nav2(field: Field, folder: Path, *, frame: str, grid: bool) -> None:
         for lane, room, a, b in zip(lanes["lane_id"], clear, first, first[1:], strict=False)
         for k in range(a, b - 1)
     ]
-    edges += _headlands(lanes, rows, first, nodes)
+    outline = field.plane(field.outline, grid=grid).union_all() if field.bounded else None
+    edges += _headlands(lanes, rows, first, nodes, outline)
     both = [way for edge in edges for way in (edge, edge._replace(start=edge.end, end=edge.start))]
     features = [_feature({"id": k, "frame": frame}, "Point", xy.tolist()) for k, xy in enumerate(nodes)]
     for k, edge in enumerate(both, start=len(nodes)):
@@ -81,7 +83,11 @@ def write_nav2(field: Field, folder: Path, *, frame: str, grid: bool) -> None:
 
 
 def _headlands(
-    lanes: gpd.GeoDataFrame, rows: gpd.GeoDataFrame, first: list[int], nodes: np.ndarray[Any, Any]
+    lanes: gpd.GeoDataFrame,
+    rows: gpd.GeoDataFrame,
+    first: list[int],
+    nodes: np.ndarray[Any, Any],
+    within: shapely.Geometry | None,
 ) -> Iterator[_Edge]:
     beside = [
         {*right.split("+"), *left.split("+")} - {""}
@@ -92,6 +98,8 @@ def _headlands(
         if beside[a] & beside[b]:
             for start, end in ((first[a], first[b]), (first[a + 1] - 1, first[b + 1] - 1)):
                 way = shapely.linestrings(nodes[[start, end]])
+                if within is not None and comes_back(np.array([way]), within).any():
+                    continue
                 if (near := float(shapely.distance(way, vines).min())) > NEAR:
                     yield _Edge(start, end, {"class": "headland", "clear_m": round(2 * near, 2)})
 
