@@ -7,6 +7,7 @@ import pytest
 
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import grid_over, sample
+from vinemap.simulate.families import family
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
 from vinemap.simulate.scenes import rows_of
@@ -67,6 +68,16 @@ def test_huts_do_not_raise_the_level(cloud):
     points = points.above(terrain_model(points))
     _, levels = canopy_cover(points, canopy_height_model(points))
     assert np.array_equal(levels.ridge.values, levels.body.values)
+
+
+@pytest.mark.parametrize("seed", [3, 14])
+def test_nothing_of_a_roof_of_leaves_is_left(cloud, seed):
+    """Not where single shoots stand out of it, nor at its edges and corners."""
+    survey = family("pergola", seed)
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    cover, _ = canopy_cover(points, canopy_height_model(points))
+    assert np.count_nonzero(cover.values > 0.12) * cover.grid.resolution**2 < 1.0
 
 
 @pytest.mark.parametrize("resolution", [0.1, 0.3, 0.7, 2.0])

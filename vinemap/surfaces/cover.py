@@ -5,7 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, binary_opening, distance_transform_edt, gaussian_filter, uniform_filter
+from scipy.ndimage import (
+    binary_dilation,
+    binary_erosion,
+    binary_opening,
+    distance_transform_edt,
+    gaussian_filter,
+    uniform_filter,
+)
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
@@ -30,6 +37,8 @@ TALLEST = 40.0
 """Metres above which nothing stands: points there are birds and noise."""
 WIDEST = 2.0
 """Metres across which no canopy of a row is closed near its top."""
+MARGIN = 0.5
+"""Metres about what is no row in which there is none."""
 TOUCHING = 1.4
 """Metres of closed canopy from which rows may touch."""
 ENOUGH = 8
@@ -42,6 +51,9 @@ FOOT, LEAST = 0.4, 0.2
 """Share of the canopies' height, and metres, from which low canopies are told from what grows beneath them."""
 RIDGE = 0.75
 """Share of the canopies' height above which rows stand apart that touch below it."""
+ROOF, FULL, UPPER = 5.0, 0.9, 0.75
+"""Metres across which a roof of leaves is closed, share of it that reaches above that share of its height, and order of
+the heights thereabouts that is its height: posts and single shoots don't tell it."""
 
 
 class Levels(NamedTuple):
@@ -107,7 +119,9 @@ def canopy_cover(
     touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
     if touching.any():
         touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
+    roofs = _roofs(chm, everything, body, grid, high)
     apart = _apart(touching, body, crown, grid, metres, resolution)
+    apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = body
     if apart.any():
@@ -119,6 +133,8 @@ def canopy_cover(
     cover /= blurred + np.float32(0.1 * density)
     no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side).repeat(k, axis=0).repeat(k, axis=1)
     cover[no_vines[: grid.ny, : grid.nx]] = 0.0
+    if roofs.any():
+        cover[_grown(roofs, MARGIN, chm.grid.resolution).ravel()[cells_in(chm.grid, grid)]] = 0.0
     return Raster(cover, grid, cloud.crs), levels
 
 
@@ -139,6 +155,31 @@ def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Gri
     lower = (high < LOWER * plants).reshape(metres.shape)
     held: Flags = near | (about & ~lower)
     return held
+
+
+def _roofs(chm: Raster, everything: Counts, body: Counts, grid: Grid, high: float) -> Flags:
+    """Cells (ny, nx) of the height model where canopy is closed across some metres, and no alley shows in its top."""
+    metres = coarser(chm.grid, resolution=1.0)
+    cells = cells_in(metres, chm.grid)
+    level = np.maximum(RIDGE * height_about(chm, high, order=UPPER), LOWEST).ravel()
+    top: Flags = (chm.values >= level[cells]) & (chm.values <= high)
+    known = np.bincount(cells[np.isfinite(chm.values)], minlength=level.size)
+
+    def closed(where: Flags) -> Flags:
+        full = np.bincount(cells[where], minlength=level.size) >= np.maximum(FULL * known, 1)
+        out: Flags = binary_opening(full.reshape(metres.shape), _disc(ROOF / 2, metres.resolution)).ravel()[cells]
+        return out
+
+    roofs = top & closed(top)
+    if roofs.any():
+        about = cells_in(chm.grid, grid).ravel()
+        points, leaves = (np.bincount(about, n.ravel(), top.size).astype(np.float64) for n in (everything, body))
+        share = _around(leaves.reshape(top.shape)) / np.maximum(_around(points.reshape(top.shape)), 1)
+        roofs &= closed(top & (share > 0.5))
+    if roofs.any():
+        # At their edges fewer points are leaves.
+        roofs = binary_dilation(roofs, mask=top, iterations=max(1, round(WIDEST / chm.grid.resolution)))
+    return roofs
 
 
 def _counts(cloud: Cloud, grid: Grid, metres: Grid, levels: tuple[Values, Values], high: float) -> Counts:
