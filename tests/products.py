@@ -3,8 +3,14 @@
 import json
 
 import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pyogrio
+import shapely
 
 from vinemap import paths
+from vinemap.geo.crs import WGS84, parse_crs, project
+from vinemap.product.layers import LAYERS, TEXT, WHOLE
 
 SURVEYS = ["collection.json", "index.html", "survey.json", "three_stac.json", "tileset.json"]
 """Files of a survey, beside the folders of its products."""
@@ -31,3 +37,25 @@ def many(cloud, path, n):
     parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
     names = [f"{name}{k}" for k in range(n) for name in parcels["name"]]
     gpd.GeoDataFrame({"name": names}, geometry=[*parcels.geometry] * n, crs=parcels.crs).to_file(path)
+
+
+def place_product(folder, parcel, lines, *, survey, flown, crs="EPSG:32632", **numbers):
+    """Put a product with such rows in a folder of them: layer ``rows`` and the records, nothing else."""
+    place = paths.parcel_folder(folder, parcel)
+    place.mkdir(parents=True)
+    known = {"height_m": 1.5, "width_m": 0.5, "volume_m3": 10.0, "spacing_m": 2.5, "confidence": 0.9} | numbers
+    known["length_m"] = shapely.length(lines)
+    kinds = LAYERS["rows"].columns
+    blank = {name: "" if kind == TEXT else 0 if kind == WHOLE else 0.0 for name, kind in kinds.items()}
+    ids = np.arange(1, len(lines) + 1)
+    known |= {"row_id": ids, "label": [f"{k} {parcel}" for k in ids]}
+    rows = gpd.GeoDataFrame(pd.DataFrame(blank, index=range(len(lines))).assign(**known), geometry=lines, crs=crs)
+    pyogrio.write_dataframe(rows, paths.geopackage(place, parcel), layer="rows", driver="GPKG")
+    outline = project(shapely.union_all(shapely.force_2d(lines)).buffer(2), parse_crs(crs), WGS84)
+    item = {"geometry": json.loads(shapely.to_geojson(outline)), "properties": {"vinemap:area_m2": 100.0}}
+    paths.stac_item(place, parcel).write_text(json.dumps(item))
+    record = {"parcel": parcel, "survey": survey, "flown": f"{flown}T12:00:00+00:00", "crs": crs, "warnings": []}
+    record |= {"key": f"{survey} {parcel}", "files": {paths.geopackage(place, parcel).name: 1}}
+    record |= {"origin": {"lat": 45.0, "lon": 8.0, "alt": 100.0}}
+    paths.run_record(place).write_text(json.dumps(record))
+    return place

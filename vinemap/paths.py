@@ -22,6 +22,7 @@ DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
+INDEX = "index.html"
 ESTATE = Path("configs/nightly.yaml")
 """Configuration of the estate whose surveys come night after night."""
 OWN_CONFIGURATION = "survey.yaml"
@@ -198,6 +199,11 @@ def exports() -> Path:
     return Path("exports")
 
 
+def table_folder(folder: Path) -> Path:
+    """Folder of the tables of all parcels that are exported together."""
+    return folder / "table"
+
+
 def export_folder(folder: Path, parcel: str, kind: str) -> Path:
     """Folder of a parcel in one of the formats of exports."""
     return parcel_folder(folder, parcel) / kind
@@ -206,6 +212,16 @@ def export_folder(folder: Path, parcel: str, kind: str) -> Path:
 def exported(folder: Path, parcel: str, layer: str, suffix: str) -> Path:
     """File of an export of a parcel."""
     return folder / f"{safe(parcel)}_{layer}{suffix}"
+
+
+def exported_table(folder: Path, name: str, kind: str) -> Path:
+    """Table of many products ("csv", "parquet")."""
+    return folder / f"{name}.{kind}"
+
+
+def data_package(folder: Path) -> Path:
+    """What the columns of the tables beside it are: descriptor of a Data Package, in which tools look for them."""
+    return folder / "datapackage.json"
 
 
 def task_data(folder: Path) -> Path:
@@ -290,7 +306,7 @@ def report(folder: Path, parcel: str) -> Path:
 
 def index(folder: Path) -> Path:
     """Page of a survey, in the folder of its products."""
-    return folder / "index.html"
+    return folder / INDEX
 
 
 def page_template(name: str) -> Path:

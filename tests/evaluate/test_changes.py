@@ -6,7 +6,7 @@ import pytest
 import shapely
 from shapely.ops import substring
 
-from vinemap.evaluate.changes import compare_rows, estimate_shift, summarise
+from vinemap.evaluate.changes import compare_rows, estimate_shift, follow_rows, summarise
 from vinemap.simulate.scenes import rows_of
 
 SHIFT = np.array([0.3, 0.4])
@@ -115,3 +115,14 @@ def test_what_was_not_seen_on_one_date_is_no_change():
     assert compare_rows(without, table(lines)).rows["d_gap_m"].notna().all()
     none = summarise(compare_rows(now.assign(unseen_m=1.0), table(lines)))
     assert np.isnan([none[name] for name in ("d_gap_m", "d_n_missing", "d_volume")]).all()
+
+
+def test_rows_are_followed_through_dates_on_which_they_arent():
+    """Four flights, each off the others: one row is missed once, one is gone, one is new."""
+    lines = rows_of(6, length=40, azimuth=20)
+    dates = [(0, 1, 2, 3, 5), (5, 3, 2, 0), (0, 1, 2, 3, 4), (0, 1, 2, 3, 4)]
+    tables = [table([lines[k] + turn * SHIFT for k in kept]) for kept, turn in zip(dates, (0, 1, -1, 0.5), strict=True)]
+    tables[3] = tables[3].to_crs("EPSG:32633")
+    numbers = [found.tolist() for found in follow_rows(tables)]
+    assert numbers == [[0, 1, 2, 3, 4], [4, 3, 2, 0], [0, 1, 2, 3, 5], [0, 1, 2, 3, 5]]
+    assert [found.tolist() for found in follow_rows([tables[0].iloc[:0], tables[1]])] == [[], [0, 1, 2, 3]]

@@ -66,8 +66,9 @@ def outline(product):
 @pytest.fixture(scope="module")
 def exported(product, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    (line,) = export_products([product], out, formats=FORMATS, lines="both")
+    line, table = export_products([product], out, formats=FORMATS, lines="both")
     assert line.startswith(f"{NAME}: 7 rows, 5 lanes → ")
+    assert table.startswith("table: 7 lines of rows (csv")
     return out / NAME
 
 

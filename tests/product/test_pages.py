@@ -23,7 +23,8 @@ from vinemap import paths
 from vinemap.geo.raster import Grid, Raster
 from vinemap.product.pages.page import page
 from vinemap.product.pages.parcel import SHADES, canopy_picture, profiles
-from vinemap.product.pages.survey import find_earlier, read_products, write_index
+from vinemap.product.pages.survey import write_index
+from vinemap.product.seasons.products import find_earlier, read_products
 from vinemap.simulate.scenes import rows_of
 
 WEB = Path(paths.__file__).parent / "product" / "pages" / "web"
@@ -251,7 +252,7 @@ def test_a_parcel_is_known_again_by_its_place(copy):
     assert (since["survey"], since["parcel"]) == ("june", "Z")
 
 
-def test_the_latest_flight_before_is_the_one(copy):
+def test_earlier_flights_are_found_the_latest_first(copy):
     shutil.copytree(copy / "june", copy / "july")
     for path in (copy / "july").glob("*/run.json"):
         path.write_text(path.read_text().replace('"2026-06-18', '"2026-07-18').replace('"june"', '"july"'))
@@ -259,8 +260,9 @@ def test_the_latest_flight_before_is_the_one(copy):
     collection.write_text(collection.read_text().replace("2026-06-18", "2026-07-18"))
     products = {product.parcel: product for product in read_products(copy / "september")}
     found = find_earlier(products, copy / "september")
-    assert {name: one.survey for name, one in found.items()} == dict.fromkeys(("A", "one", "meadow"), "july")
-    assert {one.flown for one in found.values()} == {datetime(2026, 7, 18, tzinfo=UTC)}
+    surveys = {name: [one.survey for one in earlier] for name, earlier in found.items()}
+    assert surveys == {name: ["july", "june"] for name in ("A", "one", "meadow")}
+    assert {earlier[0].flown for earlier in found.values()} == {datetime(2026, 7, 18, tzinfo=UTC)}
 
 
 def test_junk_beside_a_survey_costs_nothing(copy):

@@ -1,4 +1,4 @@
-"""``vinemap export``: write rows, lanes and canopies for tractors, robots and other programs."""
+"""``vinemap export``: write rows, lanes, canopies and tables for tractors, robots and other programs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 @click.option("--grid", is_flag=True, help="Robots' coordinates and meshes in the product's CRS; in {Main} by default.")
 @click.option("--vertices", type=click.IntRange(2, 10_000), help="Vertices of every lane; by default few.")
 def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | None, **options: Any) -> None:
-    """Write the rows of each PRODUCT (its folder or GeoPackage), and lanes between them, for tractors and robots."""
+    """Write the rows of each PRODUCT (its folder or GeoPackage, or that of a survey), and lanes between them."""
     from vinemap import paths
     from vinemap.export.write import export_products
 

@@ -15,6 +15,8 @@ import shapely
 from vinemap.evaluate.rows import match_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -95,6 +97,39 @@ def compare_rows(
         gained = np.where(hidden, np.nan, now - then) if name in SUMS else now - then
         columns |= {name: np.where(state == GONE, then, now), f"d_{name}": gained}
     return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), pd.DataFrame(columns))
+
+
+def follow_rows(dates: Sequence[gpd.GeoDataFrame]) -> list[NDArray[np.intp]]:
+    """Follow the rows of a parcel back through its dates.
+
+    Each date is compared with all rows that are known of later ones, each of these where it stood last.
+
+    Parameters
+    ----------
+    dates : sequence of GeoDataFrame
+        Layer ``rows`` of the products, the latest first.
+
+    Returns
+    -------
+    list of array (n,)
+        For each date a number for each of its rows, from 0, the same on all dates on which that row stands: its
+        position at the latest date, and from there on what is there no more.
+    """
+    known, numbers = dates[0].assign(label=range(len(dates[0]))), [np.arange(len(dates[0]))]
+    for table in dates[1:]:
+        table = table.assign(label=range(len(table)))  # noqa: PLW2901 - the same, by position
+        shift, changes = compare_rows(known, table)
+        found = np.full(len(table), NONE)
+        same = changes[changes["state"] == SAME]
+        found[same["earlier"].to_numpy(dtype=int)] = same["label"].to_numpy(dtype=int)
+        lost = np.flatnonzero(found == NONE)
+        found[lost] = len(known) + np.arange(len(lost))
+        if len(lost):
+            gone = table.iloc[lost].to_crs(known.crs)
+            gone = gone.set_geometry(gone.translate(*shift)).assign(label=found[lost])
+            known = pd.concat([known, gone], ignore_index=True)
+        numbers.append(found)
+    return numbers
 
 
 def estimate_shift(

@@ -4,5 +4,7 @@ GUIDANCE = ("agopengps", "geojson", "isoxml", "nav2", "opennav_coverage", "shape
 """Formats of lines."""
 MESHES = ("gazebo", "obj", "ply")
 """Formats of canopies."""
-FORMATS = (*GUIDANCE, *MESHES)
+TABLE = "table"
+"""Numbers of rows and vines: one table of all products and their dates."""
+FORMATS = (*GUIDANCE, *MESHES, TABLE)
 LINES = ("lanes", "rows", "both")

@@ -93,6 +93,45 @@ class Field(NamedTuple):
             yield int(block) if len(numbers) > 1 else None, self._replace(rows=rows, lanes=lanes)
 
 
+def products_of(given: Path) -> list[Path]:
+    """The products that a path means: of a survey's folder all in it, of any other the path itself.
+
+    Raises
+    ------
+    InputError
+        If there is none in the survey's folder.
+    """
+    if paths.run_record(given).is_file() or not paths.survey_record(given).is_file():
+        return [given]
+    products = sorted(record.parent for record in given.glob(f"*/{paths.RUN}"))
+    if not products:
+        raise InputError(f"{paths.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
+    return products
+
+
+def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
+    """Folder of a product, given by its folder or its GeoPackage, and the record of its run.
+
+    Raises
+    ------
+    InputError
+        If it is no whole product.
+    """
+    folder = product if product.is_dir() else product.parent
+    try:
+        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        record["parcel"] = str(record["parcel"])
+        origin_of(record["origin"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{paths.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, or its GeoPackage"
+        ) from error
+    path = paths.geopackage(folder, record["parcel"])
+    if product not in (folder, path):
+        raise InputError(f"{paths.shown(product)}: no product of vinemap: {paths.shown(path)} is one")
+    return folder, record
+
+
 def read_field(product: Path, *, lines: str, headland: float, outer: bool, vertices: int | None = None) -> Field:
     """Read a product, given by its folder or its GeoPackage, and draw its lanes if they are wanted.
 
@@ -101,17 +140,9 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     InputError
         If it is no whole product, or has no row, or no lane where one is wanted.
     """
-    folder = product if product.is_dir() else product.parent
-    try:
-        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        parcel, origin = str(record["parcel"]), origin_of(record["origin"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{paths.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, or its GeoPackage"
-        ) from error
+    folder, record = read_record(product)
+    parcel, origin = record["parcel"], origin_of(record["origin"])
     path = paths.geopackage(folder, parcel)
-    if product not in (folder, path):
-        raise InputError(f"{paths.shown(product)}: no product of vinemap: {paths.shown(path)} is one")
     try:
         layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("rows", "row_ends", "gaps", "parcel")}
     except (DataSourceError, DataLayerError) as error:

@@ -10,16 +10,16 @@ from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap import __version__, paths
 from vinemap.errors import InputError
-from vinemap.export import MESHES
+from vinemap.export import MESHES, TABLE
 from vinemap.export.agopengps import write_agopengps
-from vinemap.export.field import read_field
+from vinemap.export.field import products_of, read_field
 from vinemap.export.gazebo import write_gazebo
-from vinemap.export.geojson import write_geojson
 from vinemap.export.isoxml import write_isoxml
 from vinemap.export.meshes import write_canopy
 from vinemap.export.nav2 import write_nav2
 from vinemap.export.opennav_coverage import write_opennav_coverage
-from vinemap.export.shapefile import write_shapefile
+from vinemap.export.table import read_tables, write_tables
+from vinemap.export.vector import write_geojson, write_shapefile
 from vinemap.product import store
 
 if TYPE_CHECKING:
@@ -43,12 +43,12 @@ def export_products(
 ) -> Iterator[str]:
     """Write products into ``out/<parcel>/<format>``, each whole or not at all, and say so in a line for each parcel.
 
-    An earlier export is replaced; other files in its folder stay.
+    The table of all of them goes into ``out/table``. An earlier export is replaced; other files in its folder stay.
 
     Parameters
     ----------
     products : sequence of Path
-        Folders or GeoPackages of products; all are read before the first is written.
+        Folders or GeoPackages of products, or folders of surveys; all are read before the first is written.
     out : Path
         Folder of the parcels' folders.
     formats : sequence of str
@@ -69,12 +69,15 @@ def export_products(
     """
     if "nav2" in formats and lines == "rows":
         raise InputError("nav2 needs lanes: leave --lines rows out, or name the other formats")
-    wanted = lines if set(formats) - set(MESHES) else "rows"
+    products = [one for given in products for one in products_of(given)]
+    of_parcels = [kind for kind in formats if kind != TABLE]
+    wanted = lines if set(of_parcels) - set(MESHES) else "rows"
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
-    fields = [read_field(product, lines=wanted, **drawn) for product in products]
+    fields = [read_field(product, lines=wanted, **drawn) for product in products] if of_parcels else []
     names = [paths.safe(field.parcel) for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
+    tables = read_tables(products) if TABLE in formats else None
     robot: dict[str, Any] = {"frame": frame, "grid": grid}
     writers: dict[str, tuple[Callable[..., None], dict[str, Any]]] = {
         "agopengps": (write_agopengps, {"lines": lines}),
@@ -88,7 +91,7 @@ def export_products(
         "shapefile": (write_shapefile, {}),
     }
     for field in fields:
-        for kind in formats:
+        for kind in of_parcels:
             write, options = writers[kind]
             target = paths.export_folder(out, field.parcel, kind)
             _write_whole(
@@ -96,8 +99,13 @@ def export_products(
             )
         yield (
             f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(target.parent)} "
-            f"({', '.join(formats)})"
+            f"({', '.join(of_parcels)})"
         )
+    if tables:
+        target = paths.table_folder(out)
+        record = {"vinemap": __version__, "format": TABLE, "products": tables.products}
+        _write_whole(target, partial(write_tables, tables), record)
+        yield f"{tables.told()} → {paths.shown(target)}"
 
 
 def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, Any]) -> None:

@@ -5,55 +5,31 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from datetime import datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyogrio
 import shapely
-from pyogrio.errors import DataLayerError, DataSourceError
 from pyproj import CRS
 
 from vinemap import __version__, paths
 from vinemap.compute.threads import in_threads
-from vinemap.evaluate.changes import GONE, MEASURES, compare_rows, summarise
+from vinemap.evaluate.changes import GONE, compare_rows, summarise
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.pages.page import as_json, page, page_hash, polylines, rings
+from vinemap.product.seasons.products import find_earlier, read_products, read_rows
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     import geopandas as gpd
 
-COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
-"""What is read of rows, beside what wasn't seen of them."""
+    from vinemap.product.seasons.products import Product
+
 TOLERANCE = 0.2
 """Metres by which lines on the map may leave rows and outlines."""
-SHARED = 0.3
-"""Share of the smaller of two outlines that both hold, from which on they are the same parcel's."""
 DIGITS = {"length_m": 1, "height_m": 3, "width_m": 3, "volume_m3": 2, "gap_m": 2, "n_missing": 0}
-
-
-class Product(NamedTuple):
-    """What a survey's page wants to know of a parcel's product, without its layers."""
-
-    folder: Path
-    parcel: str
-    survey: str | None
-    flown: datetime
-    outline: shapely.Geometry
-    """In WGS 84, x east, or in local coordinates."""
-    local: bool
-    crs: str
-    area: float
-    """m²."""
-    warnings: tuple[str, ...]
-    files: dict[str, str]
-    """Names of the files that the page leads to."""
-    key: str
-    """What tells this product from others."""
 
 
 def write_index(folder: Path, survey: str) -> bool:
@@ -78,7 +54,7 @@ def write_index(folder: Path, survey: str) -> bool:
     products = {product.parcel: product for product in read_products(folder) if product.survey == survey}
     if not products and not known:
         return False
-    earlier = find_earlier(products, folder)
+    earlier = {name: before[0] for name, before in find_earlier(products, folder).items()}
     made_of: list[Any] = [
         __version__,
         page_hash("index"),
@@ -93,100 +69,6 @@ def write_index(folder: Path, survey: str) -> bool:
         return False
     write_whole(target, survey_page(survey, known, products, earlier, key=key))
     return True
-
-
-def read_products(folder: Path) -> Iterator[Product]:
-    """Products in a folder of them, as far as their records can be read."""
-    try:
-        places = sorted(folder.iterdir())
-    except OSError:
-        return
-    for place in places:
-        try:
-            item = json.loads(paths.stac_item(place, place.name).read_text(encoding="utf-8"))
-            record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
-            parcel, local = str(record["parcel"]), item["geometry"] is None
-            outline = _local_outline(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
-            linked = {
-                "report": paths.report(place, parcel),
-                "layers": paths.geopackage(place, parcel),
-                "project": paths.project(place, parcel),
-            }
-            product = Product(
-                place,
-                parcel,
-                record["survey"],
-                datetime.fromisoformat(record["flown"]),
-                shapely.make_valid(outline),
-                local,
-                str(record["crs"]),
-                float(item["properties"].get("vinemap:area_m2", np.nan)),
-                tuple(map(str, record["warnings"])),
-                {kind: path.name for kind, path in linked.items() if path.name in record["files"]},
-                as_json([record["key"], record["files"]]),
-            )
-            west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
-            if product.flown.tzinfo and (local or (-180 <= west <= east <= 180 and -90 <= south <= north <= 90)):
-                yield product
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, shapely.errors.ShapelyError):
-            continue
-
-
-def _local_outline(folder: Path, parcel: str) -> shapely.Geometry:
-    """A parcel's polygon where nothing tells of its place on the globe."""
-    try:
-        outline: shapely.Geometry = pyogrio.read_dataframe(paths.geopackage(folder, parcel), layer="parcel").union_all()
-    except (DataSourceError, DataLayerError) as error:
-        raise ValueError(str(error)) from error
-    return outline
-
-
-def find_earlier(products: Mapping[str, Product], folder: Path) -> dict[str, Product]:
-    """For each parcel the latest product of an earlier flight that overlaps it, among the surveys beside a folder."""
-    left = {name: product for name, product in products.items() if not product.local}
-    found: dict[str, Product] = {}
-    if not left:
-        return found
-    latest = max(product.flown for product in left.values())
-    for _, beside in sorted(_surveys_beside(folder.resolve(), latest), key=lambda known: known[0], reverse=True):
-        others = [product for product in read_products(beside) if product.flown < latest and not product.local]
-        outlines = np.array([product.outline for product in others], dtype=object)
-        tree = shapely.STRtree(outlines)
-        for name, product in list(left.items()):
-            near = [k for k in tree.query(product.outline).tolist() if others[k].flown < product.flown]
-            shares = {k: _shared(product.outline, outlines[k]) for k in near}
-            best = max(near, key=lambda k: (others[k].flown, shares[k]), default=None)
-            if best is not None and shares[best] < SHARED:
-                best = max(near, key=lambda k: shares[k])
-            if best is not None and shares[best] >= SHARED:
-                found[name] = others[best]
-                del left[name]
-        if not left:
-            break
-    return found
-
-
-def _surveys_beside(folder: Path, latest: datetime) -> Iterator[tuple[datetime, Path]]:
-    """Folders of other surveys beside one, and when they were flown, if before the latest of a time."""
-    try:
-        places = sorted(folder.parent.iterdir())
-    except OSError:
-        return
-    for place in places:
-        try:
-            if place == folder or not paths.survey_record(place).is_file():
-                continue
-            collection = json.loads(paths.stac_collection(place).read_text(encoding="utf-8"))
-            first, last = (datetime.fromisoformat(time) for time in collection["extent"]["temporal"]["interval"][0])
-            if first < latest:
-                yield last, place
-        except (OSError, ValueError, KeyError, TypeError, IndexError):
-            continue
-
-
-def _shared(one: shapely.Geometry, other: shapely.Geometry) -> float:
-    smaller = min(shapely.area(one), shapely.area(other))
-    return float(shapely.area(shapely.intersection(one, other)) / smaller) if smaller > 0 else 0.0
 
 
 def _outcomes(folder: Path) -> dict[str, dict[str, Any]]:
@@ -274,19 +156,6 @@ def survey_page(
     }
     title = f"{survey} · vine rows"
     return page("index", title, data, packed={"details": as_json(details).encode()}, scripts=[], key=key)
-
-
-def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
-    """Rows of a product, or None if they can't be read."""
-    path = paths.geopackage(folder, parcel)
-    try:
-        rows = pyogrio.read_dataframe(path, layer="rows", columns=[*COLUMNS, "unseen_m"])
-        rows = rows.astype(dict.fromkeys(("spacing_m", *MEASURES), float))
-        usable = set(COLUMNS) <= set(rows.columns) and rows.crs is not None
-        lines = rows[(rows.geom_type == "LineString") & (rows.length > 0)] if usable else None
-    except Exception:  # noqa: BLE001 - whatever GDAL makes of a file that isn't ours
-        return None
-    return lines
 
 
 def _compare(rows: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:

@@ -1,0 +1,186 @@
+"""Products of a survey and of those flown before it: what lies in their folders, and which show the same place."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pyogrio
+import shapely
+from pyogrio.errors import DataLayerError, DataSourceError
+
+from vinemap import paths
+from vinemap.evaluate.changes import MEASURES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    import geopandas as gpd
+
+COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
+"""What is read of rows, beside what wasn't seen of them."""
+SHARED = 0.3
+"""Share of the smaller of two outlines that both hold, from which on they are the same parcel's."""
+
+
+class Product(NamedTuple):
+    """What a survey's page wants to know of a parcel's product, without its layers."""
+
+    folder: Path
+    parcel: str
+    survey: str | None
+    flown: datetime
+    outline: shapely.Geometry
+    """In WGS 84, x east, or in local coordinates."""
+    local: bool
+    crs: str
+    area: float
+    """m²."""
+    warnings: tuple[str, ...]
+    files: dict[str, str]
+    """Names of the files that the page leads to."""
+    key: str
+    """What tells this product from others."""
+
+
+def read_products(folder: Path) -> Iterator[Product]:
+    """Products in a folder of them, as far as their records can be read."""
+    try:
+        places = sorted(folder.iterdir())
+    except OSError:
+        return
+    for place in places:
+        if product := read_product(place):
+            yield product
+
+
+def read_product(place: Path) -> Product | None:
+    """The product in a folder; None if its records can't be read, or tell of no place and time."""
+    try:
+        record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
+        parcel = str(record["parcel"])
+        item = json.loads(paths.stac_item(place, parcel).read_text(encoding="utf-8"))
+        local = item["geometry"] is None
+        outline = _local_outline(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
+        linked = {
+            "report": paths.report(place, parcel),
+            "layers": paths.geopackage(place, parcel),
+            "project": paths.project(place, parcel),
+        }
+        product = Product(
+            place,
+            parcel,
+            record["survey"],
+            datetime.fromisoformat(record["flown"]),
+            shapely.make_valid(outline),
+            local,
+            str(record["crs"]),
+            float(item["properties"].get("vinemap:area_m2", np.nan)),
+            tuple(map(str, record["warnings"])),
+            {kind: path.name for kind, path in linked.items() if path.name in record["files"]},
+            json.dumps([record["key"], record["files"]]),
+        )
+        west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
+        placed = local or (-180 <= west <= east <= 180 and -90 <= south <= north <= 90)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, shapely.errors.ShapelyError):
+        return None
+    return product if product.flown.tzinfo and placed else None
+
+
+def _local_outline(folder: Path, parcel: str) -> shapely.Geometry:
+    """A parcel's polygon where nothing tells of its place on the globe."""
+    try:
+        outline: shapely.Geometry = pyogrio.read_dataframe(paths.geopackage(folder, parcel), layer="parcel").union_all()
+    except (DataSourceError, DataLayerError) as error:
+        raise ValueError(str(error)) from error
+    return outline
+
+
+def find_earlier(products: Mapping[str, Product], folder: Path) -> dict[str, list[Product]]:
+    """For each parcel its products of earlier flights, the latest first: one of each survey beside a folder.
+
+    Which of a survey's is the same parcel its place tells, not its name; parcels that have no earlier one aren't there.
+    """
+    placed = {name: product for name, product in products.items() if not product.local}
+    found: dict[str, list[Product]] = {}
+    if not placed:
+        return found
+    latest = max(product.flown for product in placed.values())
+    for beside in _surveys_beside(folder.resolve(), latest):
+        others = [product for product in read_products(beside) if product.flown < latest and not product.local]
+        outlines = np.array([product.outline for product in others], dtype=object)
+        tree = shapely.STRtree(outlines)
+        for name, product in placed.items():
+            near = [k for k in tree.query(product.outline).tolist() if others[k].flown < product.flown]
+            shares = {k: _shared(product.outline, outlines[k]) for k in near}
+            best = max(near, key=lambda k: (others[k].flown, shares[k]), default=None)
+            if best is not None and shares[best] < SHARED:
+                best = max(near, key=lambda k: shares[k])
+            if best is not None and shares[best] >= SHARED:
+                found.setdefault(name, []).append(others[best])
+    return {name: sorted(known, key=lambda one: one.flown, reverse=True) for name, known in found.items()}
+
+
+def same_places(products: Sequence[Product]) -> list[list[int]]:
+    """Positions of products that show the same parcel, the latest first; every product is in one of the lists.
+
+    A list has one product of a survey. Of local coordinates nothing tells whether their place is the same.
+    """
+    outlines = np.array([product.outline for product in products], dtype=object)
+    tree = shapely.STRtree(outlines)
+    at: dict[int, int] = {}
+    places: list[list[int]] = []
+    for k in sorted(range(len(products)), key=lambda k: products[k].flown, reverse=True):
+        one = products[k]
+        near = [] if one.local else [j for j in tree.query(one.outline).tolist() if j in at and not products[j].local]
+        shares = {at[j]: _shared(one.outline, outlines[j]) for j in sorted(near, key=lambda j: products[j].flown)}
+        open_ = [place for place in shares if all(_survey(products[j]) != _survey(one) for j in places[place])]
+        best = max(open_, key=lambda place: shares[place], default=None)
+        if best is None or shares[best] < SHARED:
+            best = len(places)
+            places.append([])
+        places[best].append(k)
+        at[k] = best
+    return places
+
+
+def _survey(product: Product) -> tuple[str | None, datetime]:
+    return product.survey, product.flown
+
+
+def _surveys_beside(folder: Path, latest: datetime) -> Iterator[Path]:
+    """Folders of other surveys beside one that were flown before a time."""
+    try:
+        places = sorted(folder.parent.iterdir())
+    except OSError:
+        return
+    for place in places:
+        try:
+            if place == folder or not paths.survey_record(place).is_file():
+                continue
+            collection = json.loads(paths.stac_collection(place).read_text(encoding="utf-8"))
+            if datetime.fromisoformat(collection["extent"]["temporal"]["interval"][0][0]) < latest:
+                yield place
+        except (OSError, ValueError, KeyError, TypeError, IndexError):
+            continue
+
+
+def _shared(one: shapely.Geometry, other: shapely.Geometry) -> float:
+    smaller = min(shapely.area(one), shapely.area(other))
+    return float(shapely.area(shapely.intersection(one, other)) / smaller) if smaller > 0 else 0.0
+
+
+def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
+    """Rows of a product, or None if they can't be read."""
+    path = paths.geopackage(folder, parcel)
+    try:
+        rows = pyogrio.read_dataframe(path, layer="rows", columns=[*COLUMNS, "unseen_m"])
+        rows = rows.astype(dict.fromkeys(("spacing_m", *MEASURES), float))
+        usable = set(COLUMNS) <= set(rows.columns) and rows.crs is not None
+        lines = rows[(rows.geom_type == "LineString") & (rows.length > 0)] if usable else None
+    except Exception:  # noqa: BLE001 - whatever GDAL makes of a file that isn't ours
+        return None
+    return lines
