@@ -1,7 +1,6 @@
-"""A folder from which schedules are run on a Prefect server of its own, on loopback."""
+"""A folder from which flows and schedules are run on a Prefect server of its own, on loopback."""
 
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -11,9 +10,11 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from commands import free_of_prefect, here, python
+
+from flows.server import server
 from vinemap.compute.processes import descendants
 
-ROOT = Path(__file__).parents[1]
 SERVE = """
 import json, sys
 from flows.serving import serve
@@ -40,16 +41,14 @@ def gone(process):
 
 
 class Place:
-    """A folder from which schedules are run on a port of their own."""
+    """A folder from which flows and schedules are run, with a server on a port of its own."""
 
     def __init__(self, folder):
         self.folder = folder
         with socket.create_server(("127.0.0.1", 0)) as one:
             self.port = one.getsockname()[1]
         self.api = f"http://127.0.0.1:{self.port}/api"
-        kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-        self.environment = kept | {
-            "PYTHONPATH": f"{ROOT}:{folder}",
+        self.environment = here(free_of_prefect(), folder) | {
             "PREFECT_API_URL": self.api,
             "PREFECT_RUNNER_POLL_FREQUENCY": "1",
             "PREFECT_SERVER_SERVICES_SCHEDULER_RECENT_DEPLOYMENTS_LOOP_SECONDS": "1",
@@ -70,6 +69,10 @@ class Place:
             assert process.wait(60) == 2
             said.seek(0)
             return said.read().decode()
+
+    def server(self, home):
+        """A server and no schedule, for the context in which this is used."""
+        return server(self.api, home)
 
     @contextmanager
     def serving(self, *command, **options):
@@ -110,8 +113,6 @@ class Place:
         chosen = {"flow_runs": {"state": {"type": {"any_": [state]}}}} if state else {}
         return self.ask("/flow_runs/filter", chosen | {"sort": "EXPECTED_START_TIME_ASC"})
 
-    def prefect(self, *args, cwd):
-        command = [sys.executable, "-m", "prefect", *args]
-        environment = self.environment | {"PREFECT_HOME": str(self.folder / "client")}
-        options = {"cwd": cwd, "env": environment, "stdin": subprocess.DEVNULL, "timeout": 120}
-        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    def run(self, *words, cwd):
+        """Run ``-m`` a module or ``-c`` a program whose flows the server has."""
+        return python(*words, cwd=cwd, environment=self.environment | {"PREFECT_HOME": str(self.folder / "client")})

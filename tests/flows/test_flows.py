@@ -1,19 +1,30 @@
-"""The Prefect flow: the same chain with a task run a stage, silent, and errors in one line."""
+"""The Prefect flows: the same chain with a task run a stage, silent, and errors in one line."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
+import cv2
 import geopandas as gpd
 import pytest
+import yaml
+from commands import ROOT, assert_refused, free_of_prefect, python
+from drives import images, poses
+from place import Place
 
 from vinemap.parcel import STAGES
+from vinemap.simulate.camera import LOW
 from vinemap.simulate.survey import write_survey
 
-ROOT = Path(__file__).parents[2]
+NIGHTLY = """
+from pathlib import Path
+from prefect import flow, get_run_logger
+from prefect.states import Completed
+
+@flow(name="nightly")
+def nightly(config: str):
+    get_run_logger().info("mapped")
+    return Completed(message=f"{config} in {Path.cwd()}")
+"""
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +37,17 @@ def place(vineyard, tmp_path_factory):
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def flow(place, *args, code=None):
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-    environment |= {"PREFECT_HOME": str(place / "prefect"), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", code] if code else [sys.executable, "-m", "flows.parcel", *args]
-    return subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=300, env=environment, check=False)
+@pytest.fixture(scope="module")
+def served(place):
+    """The same folder with a server that has the runs of all flows, whose starts take longest."""
+    served = Place(place)
+    with served.server(place / "prefect"):
+        yield served
+
+
+def alone(place, *words):
+    """Run what has no server but one that it starts itself."""
+    return python(*words, cwd=place, environment=free_of_prefect() | {"PREFECT_HOME": str(place / "prefect")})
 
 
 def test_flow_runs_every_stage_as_a_task_and_says_one_line(place):
@@ -47,7 +64,7 @@ def test_flow_runs_every_stage_as_a_task_and_says_one_line(place):
         "import json\n"
         "print(json.dumps(asyncio.run(names())))\n"
     )
-    done = flow(place, code=code)
+    done = alone(place, "-c", code)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     said, runs = done.stdout.strip().split("\n")
@@ -56,33 +73,50 @@ def test_flow_runs_every_stage_as_a_task_and_says_one_line(place):
     assert (place / "data" / "products" / "small" / "A" / "run.json").is_file()
 
 
-@pytest.mark.parametrize(
-    ("args", "said"),
-    [
-        (("small.yaml", "B"), "survey small has no parcel 'B'"),
-        (("small.yaml", "Missing"), "did you mean 'missing'?"),
-        (("small.yaml", "../A"), "can't name a file"),
-        (("smal.yaml", "A"), "did you mean 'small.yaml'?"),
-        ((), "give a survey's configuration and a parcel"),
-    ],
-)
-def test_wrong_words(place, args, said):
-    done = flow(place, *args)
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1
+WRONG = [
+    (("small.yaml", "B"), "survey small has no parcel 'B'"),
+    (("small.yaml", "Missing"), "did you mean 'missing'?"),
+    (("small.yaml", "../A"), "can't name a file"),
+    (("smal.yaml", "A"), "did you mean 'small.yaml'?"),
+    ((), "give a survey's configuration and a parcel"),
+]
 
 
-def test_error_in_a_stage_is_one_line(place):
+@pytest.fixture(scope="module")
+def refusals(place):
+    """What the command says to each of the wrong words, and its exit code."""
+    code = (
+        "import contextlib, io, json, sys\n"
+        "import flows.parcel\n"
+        "said = []\n"
+        "for sys.argv[1:] in json.loads(sys.argv[1]):\n"
+        "    with contextlib.redirect_stderr(io.StringIO()) as stderr:\n"
+        "        try:\n"
+        "            said.append([flows.parcel.main(), ''])\n"
+        "        except SystemExit as end:\n"
+        "            said.append([end.code, stderr.getvalue()])\n"
+        "print(json.dumps(said))\n"
+    )
+    done = alone(place, "-c", code, json.dumps([words for words, _ in WRONG]))
+    assert (done.returncode, done.stderr) == (0, "")
+    return dict(zip((words for words, _ in WRONG), json.loads(done.stdout), strict=True))
+
+
+@pytest.mark.parametrize(("words", "said"), WRONG)
+def test_wrong_words(refusals, words, said):
+    code, line = refusals[words]
+    assert code == 2
+    assert said in line
+    assert line.count("\n") == 1
+
+
+def test_error_in_a_stage_is_one_line(place, served):
     (place / "broken.yaml").write_text("survey: broken\nparcels: [A]\n")
     folder = place / "data" / "surveys" / "broken"
     shutil.copytree(place / "data" / "surveys" / "small", folder)
     cloud = folder / "broken.laz"
     cloud.write_bytes((folder / "small.laz").read_bytes()[:5000])
-    done = flow(place, "broken.yaml", "A")
-    assert done.returncode == 2, done.stderr
-    assert "broken.laz" in done.stderr
-    assert done.stderr.count("\n") == 1
+    assert_refused(served.run("-m", "flows.parcel", "broken.yaml", "A", cwd=place), "broken.laz")
     assert not (place / "data" / "products" / "broken" / "A").exists()
 
 
@@ -110,7 +144,7 @@ def show():
 """
 
 
-def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
+def test_a_survey_is_a_flow_with_a_task_a_parcel(place, served):
     """Of two parcels in the same polygon, one with an origin that lies elsewhere."""
     one = gpd.read_file(place / "data" / "surveys" / "small" / "parcels.gpkg")
     gpd.GeoDataFrame({"name": ["B", "C"]}, geometry=[*one.geometry] * 2, crs=one.crs).to_file(place / "two.gpkg")
@@ -118,7 +152,8 @@ def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
         "survey: twice\ncloud: data/surveys/small/small.laz\nboundaries: two.gpkg\n"
         "parcels: [B, C]\noverrides: {C: {origin: [0, 0, 0]}}\n"
     )
-    done = flow(place, code=SEEN + "sys.argv[1:] = ['two.yaml']\ntry:\n    flows.survey.main()\nfinally:\n    show()")
+    code = SEEN + "sys.argv[1:] = ['two.yaml']\ntry:\n    flows.survey.main()\nfinally:\n    show()"
+    done = served.run("-c", code, cwd=place)
     assert done.returncode == 1
     assert done.stderr == "vinemap: 1 of 2 parcels failed\n"
     head, first, second, told = done.stdout.strip().split("\n")
@@ -133,7 +168,7 @@ def test_a_survey_is_a_flow_with_a_task_a_parcel(place):
     assert [(row["parcel"], row["state"]) for row in table] == [("B", "done"), ("C", "failed")]
 
 
-def test_only_what_may_heal_is_tried_again(place):
+def test_only_what_may_heal_is_tried_again(place, served):
     code = SEEN + (
         "from prefect import flow\n"
         "from vinemap.errors import BusyError, InputError\n"
@@ -155,6 +190,50 @@ def test_only_what_may_heal_is_tried_again(place):
         "    return given\n"
         "print(job(), ' '.join(calls))\n"
     )
-    done = flow(place, code=code)
+    done = served.run("-c", code, cwd=place)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "BUSY busy busy busy bad failed stuck stuck stuck stuck failed\n"
+
+
+def test_drives_in_one_job(served, tmp_path):
+    """A drive that fails costs no other; each stage is a task run."""
+    for k, image in enumerate(images(poses(4))):
+        (tmp_path / "frames").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), image)
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(LOW.model_dump(exclude_defaults=True)))
+    (tmp_path / "drives.yaml").write_text(
+        "camera: camera.yaml\nout: tracks\ndrives:\n  bad: {frames: [nothing]}\n"
+        "  good: {frames: [frames], start: [44.61167, 7.92442, 72.5]}\n"
+    )
+    done = served.run("-m", "flows.odometry", "drives.yaml", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stdout == "tracks/good_track.gpkg: 0.12 m in 4 frames\n"
+    assert done.stderr == "vinemap: bad: nothing: no such file or folder: give images, folders of images, or videos\n"
+    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["good_track.gpkg"]
+
+
+def test_prefect_yaml_deploys_and_a_worker_runs_it(served, tmp_path):
+    shutil.copy(ROOT / "prefect.yaml", tmp_path)
+    shutil.copytree(ROOT / "flows", tmp_path / "flows")
+    pool = served.run("-m", "prefect", "work-pool", "create", "vinemap", "--type", "process", cwd=tmp_path)
+    assert pool.returncode == 0, pool.stderr
+    deployed = served.run("-m", "prefect", "deploy", "--all", "--no-prompt", cwd=tmp_path)
+    assert deployed.returncode == 0, deployed.stdout + deployed.stderr
+    (deployment,) = served.ask("/deployments/filter", {"deployments": {"name": {"any_": ["nightly"]}}})
+    assert deployment["schedules"][0]["schedule"] == {"cron": "0 2 * * *", "timezone": "Europe/Rome", "day_or": True}
+    assert deployment["global_concurrency_limit"]["limit"] == 1
+    assert deployment["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
+    (tmp_path / "flows" / "nightly.py").write_text(NIGHTLY)
+    run = served.ask(f"/deployments/{deployment['id']}/create_flow_run", {"state": {"type": "SCHEDULED"}})["id"]
+    worked = served.run("-m", "prefect", "worker", "start", "--pool", "vinemap", "--run-once", cwd=tmp_path.parent)
+    assert worked.returncode == 0, worked.stdout + worked.stderr
+    (run,) = served.ask("/flow_runs/filter", {"flow_runs": {"id": {"any_": [run]}}})
+    assert run["state"]["message"] == f"configs/nightly.yaml in {tmp_path}"
+
+
+def test_prefect_yaml_names_no_machine():
+    text = (ROOT / "prefect.yaml").read_text(encoding="utf-8")
+    assert "http" not in text
+    assert "/home" not in text
+    (deployment,) = yaml.safe_load(text)["deployments"]
+    assert (ROOT / deployment["entrypoint"].split(":")[0]).is_file()

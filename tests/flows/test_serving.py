@@ -8,10 +8,10 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-import yaml
-from place import ROOT, Place, gone, wait
+from place import Place, gone, wait
 
 from vinemap.compute.processes import descendants
 
@@ -30,16 +30,6 @@ def job(seconds: float = 0):
     if Path("runs").stat().st_size == 2:
         return Failed(message="1 survey failed")
     return Completed(message="done")
-"""
-NIGHTLY = """
-from pathlib import Path
-from prefect import flow, get_run_logger
-from prefect.states import Completed
-
-@flow(name="nightly")
-def nightly(config: str):
-    get_run_logger().info("mapped")
-    return Completed(message=f"{config} in {Path.cwd()}")
 """
 
 
@@ -66,31 +56,19 @@ def listening(processes):
     return found
 
 
-def test_runs_fire_on_their_own_and_never_two_at_once(place):
-    with place.serving(every=2, parameters={"seconds": 2}) as (process, said):
-        wait(lambda: all(map(place.runs, ("COMPLETED", "FAILED", "CANCELLED"))))
-        assert listening([process.pid, *descendants(process.pid)]) == {"0100007F"}
-        runs = place.runs()
-        logs = {(log["level"], log["message"]) for log in place.ask("/logs/filter", {})}
-        lines = wait(lambda: "Failed" in said.read_text() and said.read_text())
-    assert (20, f"at work in {place.folder}") in logs
-    assert {run["state"]["message"] for run in runs if run["state_type"] == "FAILED"} == {"1 survey failed"}
-    assert {run["parameters"]["seconds"] for run in runs} == {2}
-    worked = sorted(
-        (run["start_time"], run["end_time"]) for run in runs if run["state_type"] in {"COMPLETED", "FAILED"}
-    )
-    assert len(worked) > 1
-    assert all(one[1] <= other[0] for one, other in pairwise(worked))
-    assert lines.startswith(f"Runs and their logs: http://127.0.0.1:{place.port}\nNext run: ")
-    assert re.search(r"^20\d\d-\d\d-\d\d \d\d:\d\d CES?T: Failed in \d+ s: 1 survey failed$", lines, re.MULTILINE)
-    assert said.read_text().endswith("\nStopped\n")
+def states(place, seconds):
+    """Of the runs with a parameter."""
+    return {run["state_type"] for run in place.runs() if run["parameters"]["seconds"] == seconds}
 
 
-def test_a_run_that_died_with_its_machine_stands_in_nobodys_way(place):
-    """After the first schedule: the same server's folder, another schedule and other parameters."""
+@pytest.fixture(scope="module")
+def seen(place):
+    """A schedule whose machine dies while a run is at work, and in its place another with other parameters.
+
+    What the server told of the second, what that said, and which run was left.
+    """
     with place.serving(every=3, parameters={"seconds": 600}) as (process, _):
-        earlier = {run["id"] for run in place.runs("COMPLETED")}
-        running = wait(lambda: place.runs("RUNNING"))[0]["id"]
+        left = wait(lambda: place.runs("RUNNING"))[0]["id"]
         orphans = descendants(process.pid)
         process.kill()
         process.wait()
@@ -98,43 +76,50 @@ def test_a_run_that_died_with_its_machine_stands_in_nobodys_way(place):
             if not gone(one):
                 os.kill(one, signal.SIGKILL)
         wait(lambda: all(map(gone, orphans)))
-    with place.serving(every=3):
-        assert place.ask("/flow_runs/filter", {"flow_runs": {"id": {"any_": [running]}}})[0]["state_type"] == "CRASHED"
-        wait(lambda: {run["id"] for run in place.runs("COMPLETED")} > earlier)
-        (deployment,) = place.ask("/deployments/filter", {})
-        assert [one["schedule"]["interval"] for one in deployment["schedules"]] == [3]
+    with place.serving(every=2, parameters={"seconds": 2}) as (process, said):
+        (crashed,) = place.ask("/flow_runs/filter", {"flow_runs": {"id": {"any_": [left]}}})
+        wait(lambda: states(place, 2) >= {"COMPLETED", "FAILED", "CANCELLED"})
+        listens = listening([process.pid, *descendants(process.pid)])
+        earlier, runs = states(place, 600), [run for run in place.runs() if run["parameters"]["seconds"] == 2]
+        logs = {(log["level"], log["message"]) for log in place.ask("/logs/filter", {})}
+        deployments = place.ask("/deployments/filter", {})
+        lines = wait(lambda: "Failed" in said.read_text() and said.read_text())
+    ended = said.read_text()
+    return SimpleNamespace(
+        crashed=crashed,
+        earlier=earlier,
+        listens=listens,
+        runs=runs,
+        logs=logs,
+        deployments=deployments,
+        lines=lines,
+        ended=ended,
+    )
 
 
-def test_prefect_yaml_deploys_and_a_worker_runs_it(place, tmp_path):
-    shutil.copy(ROOT / "prefect.yaml", tmp_path)
-    shutil.copytree(ROOT / "flows", tmp_path / "flows")
-    with place.serving(every=3600):
-        pool = place.prefect("work-pool", "create", "vinemap", "--type", "process", cwd=tmp_path)
-        assert pool.returncode == 0, pool.stderr
-        deployed = place.prefect("deploy", "--all", "--no-prompt", cwd=tmp_path)
-        assert deployed.returncode == 0, deployed.stdout + deployed.stderr
-        (deployment,) = place.ask("/deployments/filter", {"deployments": {"name": {"any_": ["nightly"]}}})
-        assert deployment["schedules"][0]["schedule"] == {
-            "cron": "0 2 * * *",
-            "timezone": "Europe/Rome",
-            "day_or": True,
-        }
-        assert deployment["global_concurrency_limit"]["limit"] == 1
-        assert deployment["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
-        (tmp_path / "flows" / "nightly.py").write_text(NIGHTLY)
-        run = place.ask(f"/deployments/{deployment['id']}/create_flow_run", {"state": {"type": "SCHEDULED"}})["id"]
-        worked = place.prefect("worker", "start", "--pool", "vinemap", "--run-once", cwd=tmp_path.parent)
-        assert worked.returncode == 0, worked.stdout + worked.stderr
-        (run,) = place.ask("/flow_runs/filter", {"flow_runs": {"id": {"any_": [run]}}})
-        assert run["state"]["message"] == f"configs/nightly.yaml in {tmp_path}"
+def test_a_run_that_died_with_its_machine_stands_in_nobodys_way(seen):
+    assert seen.crashed["state_type"] == "CRASHED"
+    assert seen.crashed["parameters"]["seconds"] == 600
+    (deployment,) = seen.deployments
+    assert [one["schedule"]["interval"] for one in deployment["schedules"]] == [2]
+    assert seen.earlier <= {"CRASHED", "CANCELLED"}
 
 
-def test_prefect_yaml_names_no_machine():
-    text = (ROOT / "prefect.yaml").read_text(encoding="utf-8")
-    assert "http" not in text
-    assert "/home" not in text
-    (deployment,) = yaml.safe_load(text)["deployments"]
-    assert (ROOT / deployment["entrypoint"].split(":")[0]).is_file()
+def test_runs_fire_on_their_own_and_never_two_at_once(place, seen):
+    assert (20, f"at work in {place.folder}") in seen.logs
+    assert {run["state"]["message"] for run in seen.runs if run["state_type"] == "FAILED"} == {"1 survey failed"}
+    worked = sorted(
+        (run["start_time"], run["end_time"]) for run in seen.runs if run["state_type"] in {"COMPLETED", "FAILED"}
+    )
+    assert len(worked) > 1
+    assert all(one[1] <= other[0] for one, other in pairwise(worked))
+
+
+def test_a_schedule_says_where_it_is_seen_and_how_runs_ended(place, seen):
+    assert seen.listens == {"0100007F"}
+    assert seen.lines.startswith(f"Runs and their logs: http://127.0.0.1:{place.port}\nNext run: ")
+    assert re.search(r"^20\d\d-\d\d-\d\d \d\d:\d\d CES?T: Failed in \d+ s: 1 survey failed$", seen.lines, re.MULTILINE)
+    assert seen.ended.endswith("\nStopped\n")
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,6 @@
 """A drive from its recording to the GeoPackage, as a user makes it."""
 
-import os
-import subprocess
-import sys
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import geopandas as gpd
@@ -234,25 +230,6 @@ def test_what_is_wrong_is_said_in_one_line(recording, tmp_path, args, says):
     assert says in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "track.gpkg").exists()
-
-
-def test_drives_in_one_job(recording, tmp_path):
-    """A drive that fails costs no other; each stage is a task run."""
-    (tmp_path / "camera.yaml").write_text(FILE)
-    (tmp_path / "drives.yaml").write_text(
-        f"camera: camera.yaml\nout: tracks\ndrives:\n  bad: {{frames: [nothing]}}\n"
-        f"  good: {{frames: ['{recording}'], start: [44.61167, 7.92442, 72.5]}}\n"
-    )
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, "-m", "flows.odometry", "drives.yaml"]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300, env=environment
-    )
-    assert done.returncode == 1
-    assert done.stdout.startswith(f"{Path('tracks') / 'good_track.gpkg'}: 0.4")
-    assert done.stderr == "vinemap: bad: nothing: no such file or folder: give images, folders of images, or videos\n"
-    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["good_track.gpkg"]
 
 
 def test_another_camera_than_the_files_is_seen(recording, tmp_path):
