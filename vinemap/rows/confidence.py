@@ -38,6 +38,8 @@ LIKE = 4
 """Nearest rows with the second narrowest of which, for its height, a canopy is compared."""
 ASIDE = 2 / 3
 """Spacings aside of a row where the next one's canopy begins."""
+LONE = 1 / 3
+"""Company of a row that has none where the others have none, either."""
 RIDGE, FLANK = 0.35, 0.2
 """Shares of a row's usual cover from which a station has canopy, and down to which that reaches across."""
 
@@ -83,11 +85,11 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -
 
     Confidence is the share of rows like it that are right, as far as a logistic model of seven ingredients tells it,
     each from 0 to 1 (``EVIDENCE`` has their weights): **company**, the share of the length along which another row runs
-    beside it at the distance that is usual for both; **whole**, that it doesn't go on beyond its end where others go
-    on, nor crosses where those beside it end; **alike**, that its canopy isn't far wider for its height than
-    theirs; **claimed**, the share beside which no canopy stands where the next row ought to be; its **support**;
-    its **contrast**; and its **length** in spacings. Canopy is cut where what was seen ends within it, at a boundary or
-    at the cloud's own edge.
+    beside it at the distance that is usual for both, which tells less where most rows stand alone; **whole**, that it
+    doesn't go on beyond its end where others go on, nor crosses where those beside it end; **alike**, that its canopy
+    isn't far wider for its height than theirs; **claimed**, the share beside which no canopy stands where the next row
+    ought to be; its **support**; its **contrast**; and its **length** in spacings. Canopy is cut where what was seen
+    ends within it, at a boundary or at the cloud's own edge.
 
     Parameters
     ----------
@@ -150,9 +152,10 @@ def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -> 
     level = at.median(np.where(ridge >= at.median(ridge)[at.row], ridge, np.nan))
     standing = ridge > RIDGE * level[at.row]
     shape = _aspect(at, chm, normal, np.where(standing, usual[at.row], np.nan))
+    company = at.share(_accompanied(at, beside, usual))
     return pd.DataFrame(
         {
-            "company": at.share(_accompanied(at, beside, usual)),
+            "company": np.maximum(company, LONE * (1 - float(np.median(company)))),
             "whole": 1 - np.maximum(_goes_on(at, usual, seen), _crosses(at, beside, usual)),
             "alike": _alike(lines, shape),
             "claimed": 1 - at.share(_unclaimed(at, beside, usual, cover, normal, level)),
