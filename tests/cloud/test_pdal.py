@@ -1,9 +1,7 @@
 """PDAL as an engine: its pipelines on a stand-in that works as PDAL does, the error without it, and PDAL itself."""
 
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from commands import free_of_prefect, python
 from pyproj import CRS, Transformer
 
 from vinemap import paths
@@ -362,20 +361,15 @@ def test_commands_without_pdal_end_at_once(tmp_path, command, settings):
     """One line and exit code 2 before anything is read, simulated or written, even if somebody has PDAL."""
     (tmp_path / "pdal.py").write_text("raise ImportError('libpdalcpp.so: cannot open shared object file')\n")
     (tmp_path / "s.yaml").write_text(settings)
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_")}
-    environment |= {"PREFECT_HOME": str(tmp_path / "prefect"), "PYTHONDONTWRITEBYTECODE": "1"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-m", *command]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment, check=False
-    )
+    environment = free_of_prefect() | {"PREFECT_HOME": str(tmp_path / "prefect")}
+    done = python("-m", *command, cwd=tmp_path, environment=environment)
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
     assert done.stderr.startswith("vinemap: ground.engine: pdal")
     assert done.stderr.count("\n") == 1
     for word in ("libpdalcpp.so", "conda install -c conda-forge python-pdal", "leave ground.engine out"):
         assert word in done.stderr
-    assert {path.name for path in tmp_path.iterdir()} - {"prefect"} == {"pdal.py", "s.yaml"}
+    assert {path.name for path in tmp_path.iterdir()} - {"prefect", "__pycache__"} == {"pdal.py", "s.yaml"}
 
 
 def test_pdal_itself(tmp_path, vineyard):

@@ -1,8 +1,6 @@
 """Clouds in tiles on disk: no point lost or twice, and the same result as in memory."""
 
 import json
-import subprocess
-import sys
 
 import geopandas as gpd
 import laspy
@@ -11,6 +9,7 @@ import pandas as pd
 import pytest
 import rasterio
 import shapely
+from commands import python
 from pyproj import CRS
 from systems import POSIX
 
@@ -317,14 +316,7 @@ def test_a_full_disk_is_one_line(tmp_path, survey, command):
     halves = shapely.box(0, 4e6, 414_700, 5e6), shapely.box(414_700, 4e6, 5e5, 5e6)
     gpd.GeoDataFrame({"name": ["A", "B"]}, geometry=list(halves), crs=32632).to_file(tmp_path / "b.gpkg")
     words = ["--settings", "s.yaml"] if command == "run" else ["--boundaries", "b.gpkg"]
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED, command, survey, "--out", tmp_path / "new" / "out", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    done = python("-c", LIMITED, command, survey, "--out", tmp_path / "new" / "out", *words, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert done.stderr.count("\n") == 1
     assert "can't be written (File too large): choose another folder" in done.stderr

@@ -5,8 +5,6 @@ import io
 import json
 import os
 import shutil
-import subprocess
-import sys
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +15,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from commands import vinemap
 from systems import LINUX, POSIX
 
 from vinemap import paths
@@ -441,9 +440,7 @@ def test_a_job_beside_another_by_the_command(done):
     words = ["survey", done.cloud, "--boundaries", done.boundaries, "--out", done.folder]
     before = sorted(done.folder.rglob("*"))
     with store.workshop(done.folder):
-        command = subprocess.run(
-            [sys.executable, "-m", "vinemap", *map(str, words)], capture_output=True, text=True, check=False
-        )
+        command = vinemap(*words, cwd=done.folder.parent)
     assert command.returncode == 2
     assert command.stdout == ""
     assert command.stderr == f"vinemap: {done.folder}: another job is at work here: wait until it is done\n"

@@ -1,9 +1,5 @@
 """The benchmark of accuracy sees every kind of error, and marks what misses its bar."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import geopandas as gpd
 import numpy as np
 import pytest
@@ -11,6 +7,7 @@ import shapely
 import shapely.affinity
 import shapely.ops
 from click.testing import CliRunner
+from commands import python
 
 from vinemap.geo.raster import Grid, Raster
 from vinemap.measure.accuracy.__main__ import main
@@ -211,14 +208,9 @@ def test_a_family_is_measured_and_drawn(tmp_path):
     assert (tmp_path / "short.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command():
-    run = subprocess.run(
-        [sys.executable, "-m", "vinemap.measure.accuracy", "short", "--seeds", "1", "--markdown"],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+def test_the_command(tmp_path):
+    run = python("-m", "vinemap.measure.accuracy", "short", "--seeds", "1", "--markdown", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
     assert run.stdout.splitlines()[2].startswith("| short | ")
     assert "surveys: 1, in" in run.stderr
     assert CliRunner().invoke(main, ["vines"]).exit_code == 2

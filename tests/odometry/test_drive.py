@@ -8,6 +8,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from commands import vinemap
 from drives import images, poses
 from pyproj import Geod
 
@@ -195,15 +196,10 @@ def test_a_start_elsewhere_is_told(recording, rows, tmp_path):
         map_drive([recording], tmp_path / "a.gpkg", camera=LOW, rows=rows)
 
 
-def vinemap(folder, *args):
-    command = [sys.executable, "-c", "from vinemap.cli.main import main; main()", *map(str, args)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
-
-
 def test_the_command(recording, rows, tmp_path):
     (tmp_path / "camera.yaml").write_text(FILE)
     args = ("track", recording, "--camera", "camera.yaml", "--rows", rows)
-    done = vinemap(tmp_path, *args, "--start", "44.61167,7.92442,72.5", "--method", "quadratic")
+    done = vinemap(*args, "--start", "44.61167,7.92442,72.5", "--method", "quadratic", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("track.gpkg: 0.4")
     assert set(gpd.read_file(tmp_path / "track.gpkg", layer="poses")["row"]) == {"7 F"}
@@ -225,7 +221,7 @@ def test_the_command(recording, rows, tmp_path):
 def test_what_is_wrong_is_said_in_one_line(recording, tmp_path, args, says):
     (tmp_path / "camera.yaml").write_text(FILE)
     (tmp_path / "bad.yaml").write_text(FILE.replace("fx:", "#"))
-    done = vinemap(tmp_path, "track", recording, "--camera", "camera.yaml", *args)
+    done = vinemap("track", recording, "--camera", "camera.yaml", *args, cwd=tmp_path)
     assert done.returncode == 2
     assert says in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
