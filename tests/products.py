@@ -39,7 +39,7 @@ def many(cloud, path, n):
     gpd.GeoDataFrame({"name": names}, geometry=[*parcels.geometry] * n, crs=parcels.crs).to_file(path)
 
 
-def place_product(folder, parcel, lines, *, survey, flown, crs="EPSG:32632", **numbers):
+def place_product(folder, parcel, lines, *, survey, flown, crs="EPSG:32632", key="", **numbers):
     """Put a product with such rows in a folder of them: layer ``rows`` and the records, nothing else."""
     place = paths.parcel_folder(folder, parcel)
     place.mkdir(parents=True)
@@ -55,7 +55,7 @@ def place_product(folder, parcel, lines, *, survey, flown, crs="EPSG:32632", **n
     item = {"geometry": json.loads(shapely.to_geojson(outline)), "properties": {"vinemap:area_m2": 100.0}}
     paths.stac_item(place, parcel).write_text(json.dumps(item))
     record = {"parcel": parcel, "survey": survey, "flown": f"{flown}T12:00:00+00:00", "crs": crs, "warnings": []}
-    record |= {"key": f"{survey} {parcel}", "files": {paths.geopackage(place, parcel).name: 1}}
+    record |= {"key": key or f"{survey} {parcel}", "files": {paths.geopackage(place, parcel).name: 1}}
     record |= {"origin": {"lat": 45.0, "lon": 8.0, "alt": 100.0}}
     paths.run_record(place).write_text(json.dumps(record))
     return place

@@ -1,6 +1,7 @@
 """The pages in a real browser, without a network: what is drawn, and what a click does."""
 
 import json
+import re
 import shutil
 import tempfile
 import time
@@ -261,6 +262,52 @@ def test_the_survey_shows_parcels_and_changes(flights, open_page):
     bring(browser, browser.find_element(By.CSS_SELECTOR, "#rows a")).click()
     assert drawn(browser, "drawn")
     assert browser.find_element(By.ID, "title").text == "A"
+
+
+def choose(browser, one, value):
+    script = "const one = document.getElementById(arguments[0]); one.value = arguments[1];"
+    browser.execute_script(script + "one.dispatchEvent(new Event('change'))", one, value)
+
+
+def test_the_survey_shows_its_parcels_over_the_dates(flights, open_page):
+    browser = open_page(paths.index(flights / "september"))
+    plots = browser.find_elements(By.CSS_SELECTOR, "#plots button")
+    assert [plot.text.split("\n")[0] for plot in plots] == ["A", "meadow", "one"]
+    words = plots[0].find_element(By.CSS_SELECTOR, "svg").get_attribute("aria-label")
+    june, september = numbers(
+        re.fullmatch(r"A, height \(m\): 18 June 2026 (.+), 14 September 2026 (.+)", words).groups()
+    )
+    assert [june, september] == pytest.approx([1.8, 2.0], abs=0.06)
+    before = colours(browser, "#map canvas")
+    choose(browser, "quantity", "rows-height")
+    until(lambda: colours(browser, "#map canvas") != before)
+    assert "Rows: change of height, m" in browser.find_element(By.ID, "legend").text
+    choose(browser, "to", "june")
+    assert "on both of these dates" in browser.find_element(By.ID, "facts").text
+    choose(browser, "from", "june")
+    assert "two flights, not one" in browser.find_element(By.ID, "facts").text
+    choose(browser, "to", "")
+    assert "4 rows stand as before" in browser.find_element(By.ID, "facts").text
+    bring(browser, plots[2]).click()
+    assert plots[2].get_attribute("aria-pressed") == "true"
+    assert browser.find_element(By.ID, "parcel").get_property("selectedOptions")[0].text == "one"
+
+
+def test_a_parcel_shows_its_rows_over_the_dates(flights, open_page):
+    browser = open_page(page_of(flights, "A"))
+    _, shown = column(browser, "18 Jun", "#dates")
+    assert len(shown) == 6
+    names = [row.text for row in browser.find_elements(By.CSS_SELECTOR, "#dates tbody th")]
+    assert [name.startswith("was ") for name in names] == [False] * 5 + [True]
+    plots = browser.find_elements(By.CSS_SELECTOR, "#season-plots svg")
+    assert len(plots) == 4
+    assert plots[0].get_attribute("aria-label").startswith("1 A, height (m): 18 June 2026")
+    browser.find_element(By.ID, "after").click()
+    assert browser.find_elements(By.CSS_SELECTOR, "#dates tr[aria-current] th")[0].text == "2 A"
+    before = colours(browser, "#map canvas")
+    choose(browser, "quantity", "grown-height")
+    until(lambda: colours(browser, "#map canvas") != before)
+    assert browser.find_element(By.ID, "from").is_displayed()
 
 
 def test_odd_words_are_shown_as_words(flights, open_page, tmp_path):

@@ -188,12 +188,12 @@ def test_a_survey_tells_what_became_of_each_parcel(flights):
     assert (parcels["A"]["state"], parcels["A"]["rows"], parcels["meadow"]["rows"]) == ("done", 5, 0)
     assert parcels["A"]["files"] == {"report": "A_report.html", "layers": "A.gpkg", "project": "A.qgz"}
     assert page.data()["flown"][0][:10] == "2026-09-14"
-    assert [len(lines) for lines in json.loads(page.unpacked("details"))["lines"].values()] == [5, 0, 1]
+    assert [len(told["lines"]) for told in json.loads(page.unpacked("details")).values()] == [5, 0, 1]
 
 
 def test_a_survey_tells_what_has_changed_since_the_one_before(flights):
     parcels = by_parcel(survey_index(flights / "september"))
-    rows = json.loads(survey_index(flights / "september").unpacked("details"))["changes"]["A"]
+    rows = json.loads(survey_index(flights / "september").unpacked("details"))["A"]["changes"]
     known = parcels["A"]
     assert known["since"]["survey"] == "june"
     assert known["since"]["flown"][:10] == "2026-06-18"

@@ -50,9 +50,10 @@ class Changes(NamedTuple):
     """Metres to the east and north by which the later survey lies off the earlier one."""
     rows: pd.DataFrame
     """A line a row of the later date, then those that are gone: ``state`` ("same", "new", "gone"), ``label`` and
-    ``earlier`` (its label at that date), ``part_of`` (label of the other date's row that it was split from or joined
-    to), its numbers, ``length_m`` and so on, and what one that is the same has gained, ``d_length_m`` and so on. What
-    it has gained in volume, gaps and missing vines isn't known, NaN, where a part of it wasn't seen on either date."""
+    ``earlier`` (its label at that date), ``place`` and ``earlier_place`` (positions in the tables, -1 for none),
+    ``part_of`` (label of the other date's row that it was split from or joined to), its numbers, ``length_m`` and so
+    on, and what one that is the same has gained, ``d_length_m`` and so on. What it has gained in volume, gaps and
+    missing vines isn't known, NaN, where a part of it wasn't seen on either date."""
 
 
 def compare_rows(
@@ -90,6 +91,7 @@ def compare_rows(
     part_of[state == NEW] = labels_before[_part_of(moved[is_now[state == NEW]], before, near)]
     part_of[state == GONE] = labels[_part_of(before[lost], moved, near)]
     columns = {"state": state, "label": labels[is_now], "earlier": labels_before[was], "part_of": part_of}
+    columns |= {"place": is_now, "earlier_place": was}
     pairs = (later, is_now), (earlier, was)
     hidden = np.any([_column(table, "unseen_m", places) > 0 for table, places in pairs if "unseen_m" in table], axis=0)
     for name in MEASURES:
@@ -99,7 +101,7 @@ def compare_rows(
     return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), pd.DataFrame(columns))
 
 
-def follow_rows(dates: Sequence[gpd.GeoDataFrame]) -> list[NDArray[np.intp]]:
+def follow_rows(dates: Sequence[gpd.GeoDataFrame], *, latest: Changes | None = None) -> list[NDArray[np.intp]]:
     """Follow the rows of a parcel back through its dates.
 
     Each date is compared with all rows that are known of later ones, each of these where it stood last.
@@ -108,6 +110,8 @@ def follow_rows(dates: Sequence[gpd.GeoDataFrame]) -> list[NDArray[np.intp]]:
     ----------
     dates : sequence of GeoDataFrame
         Layer ``rows`` of the products, the latest first.
+    latest : Changes, optional
+        Those between the first two, where they are known.
 
     Returns
     -------
@@ -115,19 +119,18 @@ def follow_rows(dates: Sequence[gpd.GeoDataFrame]) -> list[NDArray[np.intp]]:
         For each date a number for each of its rows, from 0, the same on all dates on which that row stands: its
         position at the latest date, and from there on what is there no more.
     """
-    known, numbers = dates[0].assign(label=range(len(dates[0]))), [np.arange(len(dates[0]))]
-    for table in dates[1:]:
-        table = table.assign(label=range(len(table)))  # noqa: PLW2901 - the same, by position
-        shift, changes = compare_rows(known, table)
+    known, numbers = dates[0], [np.arange(len(dates[0]))]
+    for k, table in enumerate(dates[1:]):
+        shift, changes = latest if latest and k == 0 else compare_rows(known, table)
+        place, earlier = changes["place"].to_numpy(), changes["earlier_place"].to_numpy()
         found = np.full(len(table), NONE)
-        same = changes[changes["state"] == SAME]
-        found[same["earlier"].to_numpy(dtype=int)] = same["label"].to_numpy(dtype=int)
+        there = (place != NONE) & (earlier != NONE)
+        found[earlier[there]] = place[there]
         lost = np.flatnonzero(found == NONE)
         found[lost] = len(known) + np.arange(len(lost))
         if len(lost):
             gone = table.iloc[lost].to_crs(known.crs)
-            gone = gone.set_geometry(gone.translate(*shift)).assign(label=found[lost])
-            known = pd.concat([known, gone], ignore_index=True)
+            known = pd.concat([known, gone.set_geometry(gone.translate(*shift))], ignore_index=True)
         numbers.append(found)
     return numbers
 

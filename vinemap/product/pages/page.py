@@ -68,7 +68,7 @@ def page(
     later = [
         f'<script type="text/plain" id="{one}-js">{part}</script>' for one, part in zip(scripts, parts[1:], strict=True)
     ]
-    blocks = [f'<script type="text/plain" id="{key}">{_pack(value)}</script>' for key, value in packed.items()]
+    blocks = [_block(name, value) for name, value in packed.items()]
     licences = f'<script type="text/plain" id="licences">\n{_part(paths.PAGE_LICENCES)}\n</script>'
     return Template(_part(paths.page_template(name))).substitute(
         policy=policy,
@@ -79,6 +79,29 @@ def page(
         blocks="\n".join([*blocks, *later, licences]),
         script=parts[0],
     )
+
+
+def _block(name: str, data: bytes) -> str:
+    return f"{_opening(name)}{_pack(data)}</script>"
+
+
+def _opening(name: str) -> str:
+    return f'<script type="text/plain" id="{name}">'
+
+
+def unpacked(page: str, name: str) -> Any:
+    """What a page holds packed by a name, as JSON; None if it has nothing of that name, or nothing that can be read."""
+    found = page.partition(_opening(name))[2].partition("</script>")[0]
+    try:
+        return json.loads(zlib.decompress(base64.b64decode(found)))
+    except (ValueError, zlib.error):
+        return None
+
+
+def repacked(page: str, name: str, data: bytes) -> str:
+    """A page with other data packed by a name; as it was if it has nothing of that name."""
+    before, opening, rest = page.partition(_opening(name))
+    return before + _block(name, data) + rest.partition("</script>")[2] if opening else page
 
 
 def page_hash(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from affine import Affine
 from vinemap import paths
 from vinemap.errors import own_fault
 from vinemap.geo.raster import block_sum
-from vinemap.product.pages.page import as_json, page, polylines, rings, whole_numbers
+from vinemap.product.pages.page import as_json, page, polylines, repacked, rings, whole_numbers
+from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,6 +57,8 @@ UNMAPPED = {"area_m2": 1, "share": 4, "height_m": 1, "width_m": 1}
 """Columns of ``unmapped`` on the page, and their decimals."""
 MEANS = ("height_m", "width_m", "support", "confidence", "canopy_confidence")
 """Columns of ``rows`` whose mean the page tells."""
+HISTORY = "history"
+"""Where the page holds the numbers of its rows on all dates, once there is more than one."""
 RECORD = (
     "vinemap",
     "survey",
@@ -119,7 +123,7 @@ def parcel_page(
         },
     }
     details = {"profiles": profiles(layers["sections"]), "terrain": terrain(dtm)}
-    packed = {"details": as_json(details).encode(), "canopies": canopies}
+    packed = {"details": as_json(details).encode(), "canopies": canopies, HISTORY: b"null"}
     title = f"{record['parcel']} · vine rows"
     return page("report", title, data, packed=packed, scripts=["canopies"])
 
@@ -222,3 +226,20 @@ def write_page(
         return [f"it has no page: {own_fault(error)}"]
     paths.report(folder, parcel).write_text(page, encoding="utf-8")
     return []
+
+
+def tell_seasons(folder: Path, parcel: str, seasons: Mapping[str, Any] | None, key: str) -> None:
+    """Have a product's page show what :func:`vinemap.product.seasons.history.history` gives, or nothing any more.
+
+    The product's record tells the page's new size, and the key of what it shows.
+
+    Raises
+    ------
+    OSError
+        If it can't be read or written.
+    """
+    path = paths.report(folder, parcel)
+    record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+    write_whole(path, repacked(path.read_text(encoding="utf-8"), HISTORY, as_json(seasons).encode()))
+    record["files"][path.name] = path.stat().st_size
+    write_whole(paths.run_record(folder), json.dumps(record | {"seasons": key}, indent=2, ensure_ascii=False))

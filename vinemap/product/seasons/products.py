@@ -44,6 +44,8 @@ class Product(NamedTuple):
     """Names of the files that the page leads to."""
     key: str
     """What tells this product from others."""
+    told: str
+    """What tells the seasons that its page shows from others; nothing while it shows none."""
 
 
 def read_products(folder: Path) -> Iterator[Product]:
@@ -81,7 +83,10 @@ def read_product(place: Path) -> Product | None:
             float(item["properties"].get("vinemap:area_m2", np.nan)),
             tuple(map(str, record["warnings"])),
             {kind: path.name for kind, path in linked.items() if path.name in record["files"]},
-            json.dumps([record["key"], record["files"]]),
+            json.dumps(
+                [record["key"], {name: n for name, n in record["files"].items() if name != linked["report"].name}]
+            ),
+            str(record.get("seasons", "")),
         )
         west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
         placed = local or (-180 <= west <= east <= 180 and -90 <= south <= north <= 90)
@@ -177,7 +182,7 @@ def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:
     """Rows of a product, or None if they can't be read."""
     path = paths.geopackage(folder, parcel)
     try:
-        rows = pyogrio.read_dataframe(path, layer="rows", columns=[*COLUMNS, "unseen_m"])
+        rows = pyogrio.read_dataframe(path, layer="rows", columns=[*COLUMNS, "canopy_confidence", "unseen_m"])
         rows = rows.astype(dict.fromkeys(("spacing_m", *MEASURES), float))
         usable = set(COLUMNS) <= set(rows.columns) and rows.crs is not None
         lines = rows[(rows.geom_type == "LineString") & (rows.length > 0)] if usable else None

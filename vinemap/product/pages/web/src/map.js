@@ -5,6 +5,8 @@ import { at, colour, element, number, onScheme } from "./page.js";
 import { piece, pointAt } from "./line.js";
 import { boundsOf, keepInSight, place, plan } from "./plan.js";
 import { range, shade, stops } from "./scale.js";
+import { chooseDates, placeIn } from "./dates.js";
+import { MEASURES, growthOf } from "./seasons.js";
 
 const PIECE = 4; // metres of a row that have one colour
 const QUANTITIES = {
@@ -29,7 +31,12 @@ function pieces(row, profile, of) {
   });
 }
 
-export function showMap(rows, profiles, selected) {
+/** Growth of rows between two flights, by the same names as what is measured. */
+const GROWTH = Object.fromEntries(Object.entries(MEASURES).map(([name, { title, ...measure }]) => [`grown-${name}`, {
+  ...measure, title: `Change of ${title.toLowerCase()}`, diverging: true, measure: MEASURES[name],
+}]));
+
+export function showMap(rows, profiles, selected, seasons = null) {
   const map = plan("map");
   for (const [name, above] of [["picture", 200], ["unmapped", 402], ["pieces", 410], ["halo", 405], ["hits", 450], ["numbers", 460]]) {
     map.createPane(name).style.zIndex = above;
@@ -87,8 +94,12 @@ export function showMap(rows, profiles, selected) {
   }
 
   const chosen = at("quantity");
+  const quantities = { ...QUANTITIES, ...(seasons ? GROWTH : {}) };
+  const [dates, placed] = seasons ? [chooseDates(seasons), placeIn(seasons)] : [];
+  const grown = (row, measure) => growthOf(seasons, measure, placed(row), dates.get().from, dates.get().to);
   function paint() {
-    const quantity = QUANTITIES[chosen.value];
+    const quantity = quantities[chosen.value];
+    document.querySelectorAll(".between").forEach((label) => { label.hidden = !quantity.measure; });
     drawn.clearLayers();
     outline.setStyle({ color: colour("outline") });
     unmapped.forEach((one) => one.setStyle({ color: colour("unmapped") }));
@@ -97,12 +108,17 @@ export function showMap(rows, profiles, selected) {
     if (!rows.length) return legend(null);
     const parts = rows.flatMap((row) => {
       const profile = profiles[row.row_id];
+      if (quantity.measure) return [{ value: grown(row, quantity.measure), line: row.line.points }];
       if (quantity.of && profile) return pieces(row, profile, quantity.of);
       return quantity.of ? [] : [{ value: quantity.row(row), line: row.line.points }];
     });
-    const span = range(parts.map((part) => part.value), { zero: chosen.value === "gaps", least: chosen.value === "gaps" ? 5 : 0.1 });
+    const turned = chosen.value === "gaps" || quantity.turned;
+    const span = range(parts.map((part) => part.value), {
+      zero: chosen.value === "gaps", least: quantity.least ?? (chosen.value === "gaps" ? 5 : 0.1), diverging: quantity.diverging,
+    });
     for (const { value, line } of parts) {
-      new Polyline(line.map(place), { renderer: canvas, interactive: false, lineCap: "butt", color: shade(chosen.value === "gaps" ? span[1] - value : value, chosen.value === "gaps" ? [0, span[1]] : span) }).addTo(drawn);
+      const tint = value === null ? colour("rule") : shade(turned ? span[0] + span[1] - value : value, span, quantity.diverging);
+      new Polyline(line.map(place), { renderer: canvas, interactive: false, lineCap: "butt", color: tint }).addTo(drawn);
     }
     for (const [lines, name] of [[gaps, "gap"], [unseen, "soft"]]) {
       lines.forEach((line) => { line.remove(); line.setStyle({ color: colour(name) }).addTo(map); });
@@ -113,12 +129,14 @@ export function showMap(rows, profiles, selected) {
 
   function legend(quantity, [low, high] = []) {
     const bar = element("span", { class: "ramp", "aria-hidden": "true" });
-    const colours = chosen.value === "gaps" ? [...stops()].reverse() : stops();
+    const [known, signed] = [stops(quantity?.diverging), { signed: Boolean(quantity?.diverging) }];
+    const colours = chosen.value === "gaps" || quantity?.turned ? [...known].reverse() : known;
     bar.style.background = `linear-gradient(to right, ${colours.join(", ")})`;
     const ink = element("span", { class: "ramp ink", "aria-hidden": "true" });
     at("legend").replaceChildren(...[
       quantity && element("span", {}, `${quantity.title}, ${quantity.unit}`),
-      quantity && element("span", { class: "key" }, number(low, quantity.digits), bar, number(high, quantity.digits)),
+      quantity && element("span", { class: "key" }, number(low, quantity.digits, signed), bar, number(high, quantity.digits, signed)),
+      quantity?.measure && element("span", { class: "key" }, element("span", { class: "dash unknown" }), "not known on both dates, or not to be trusted"),
       quantity && element("span", { class: "key" }, element("span", { class: "dash" }), "gap"),
       unseen.length ? element("span", { class: "key" }, element("span", { class: "dash dark" }), "not seen") : null,
       unmapped.length ? element("span", { class: "key" }, element("span", { class: "patch" }), "in no row") : null,
@@ -126,8 +144,9 @@ export function showMap(rows, profiles, selected) {
     ].filter(Boolean));
   }
 
-  chosen.append(...Object.entries(QUANTITIES).map(([name, { title }]) => element("option", { value: name }, title)));
+  chosen.append(...Object.entries(quantities).map(([name, { title }]) => element("option", { value: name }, title)));
   chosen.addEventListener("change", paint);
+  dates?.subscribe(paint);
   if (!rows.length) chosen.parentElement.hidden = true;
   onScheme(paint);
   map.on("zoomend", thin);

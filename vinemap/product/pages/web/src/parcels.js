@@ -3,6 +3,7 @@ import { Canvas, LayerGroup, Marker, Polygon, Polyline, divIcon } from "leaflet/
 import { at, colour, element, number, onScheme } from "./page.js";
 import { boundsOf, keepInSight, place, plan } from "./plan.js";
 import { range, shade, stops } from "./scale.js";
+import { MEASURES, growthOf, isDoubtful, valueOf } from "./seasons.js";
 
 const QUANTITIES = {
   rows: { title: "Rows alone" },
@@ -12,9 +13,12 @@ const QUANTITIES = {
   volume: { title: "Change of volume", unit: "%", digits: 1, of: ({ summary }) => (summary?.d_volume === undefined || summary.d_volume === null ? null : 100 * summary.d_volume), diverging: true, least: 2 },
   tall: { title: "Change of height", unit: "m", digits: 2, of: ({ summary }) => summary?.d_height_m, diverging: true, least: 0.05 },
   missing: { title: "Change of missing vines", unit: "vines", digits: 0, of: ({ summary }) => summary?.d_n_missing, diverging: true, least: 2, turned: true },
+  ...Object.fromEntries(Object.entries(MEASURES).map(([name, measure]) => [`rows-${name}`, {
+    title: `Rows: change of ${measure.title.toLowerCase()}`, unit: measure.unit, digits: measure.digits, least: measure.least, turned: measure.turned, diverging: true, measure,
+  }])),
 };
 
-export function showParcels(parcels, rows, [west, south, east, north], selected) {
+export function showParcels(parcels, pair, [west, south, east, north], selected) {
   const map = plan("map");
   const all = [[south, west], [north, east]];
   keepInSight(map, all);
@@ -28,7 +32,7 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
   const frame = new Polygon([], { renderer: canvas, fill: false, weight: 3, interactive: false });
   const marks = new LayerGroup().addTo(map); // rows that are new or gone
   let show = () => {};
-  const options = Object.entries(QUANTITIES).filter(([, { of }]) => !of || parcels.some((parcel) => Number.isFinite(of(parcel))));
+  const options = Object.entries(QUANTITIES).filter(([, { of, measure }]) => (measure ? parcels.some((parcel) => parcel.seasons) : !of || parcels.some((parcel) => Number.isFinite(of(parcel)))));
   const chosen = at("quantity");
   chosen.append(...options.map(([name, { title }]) => element("option", { value: name }, title)));
 
@@ -36,7 +40,8 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
     drawn.clearLayers();
     const quantity = QUANTITIES[chosen.value];
     const values = parcels.map((parcel) => (quantity.of ? quantity.of(parcel) : null));
-    const span = range(values, quantity);
+    const grown = parcels.map((parcel) => (quantity.measure ? growth(parcel, quantity.measure) : []));
+    const span = range(quantity.measure ? grown.flat() : values, quantity);
     const tint = (value) => shade(quantity.turned ? span[0] + span[1] - value : value, span, quantity.diverging);
     parcels.forEach((parcel, k) => {
       const value = values[k];
@@ -46,13 +51,40 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
       });
       shape.bindTooltip(() => hint(parcel, quantity, value), { sticky: true, className: "about", opacity: 1 });
       shape.on("click", () => selected.set(parcel)).addTo(drawn);
-      const lines = (rows[parcel.parcel] ?? []).map((line) => line.map(place));
+      if (quantity.measure) {
+        parcel.lines.forEach((line, row) => {
+          const one = grown[k][row] ?? null;
+          new Polyline(line.map(place), { renderer: canvas, weight: 4, color: one === null ? colour("rule") : tint(one) })
+            .bindTooltip(() => rowHint(parcel, row, quantity.measure, one), { sticky: true, className: "about", opacity: 1 })
+            .on("click", () => selected.set(parcel)).addTo(drawn);
+        });
+        return;
+      }
+      const lines = parcel.lines.map((line) => line.map(place));
       new Polyline(lines, { renderer: canvas, interactive: false, weight: 1.3, color: Number.isFinite(value) ? colour("map") : colour("line"), opacity: 0.9 }).addTo(drawn);
     });
     frame.setStyle({ color: colour("selected") });
     if (frame.getLatLngs().flat(2).length) frame.remove().addTo(map);
     show();
     legend(quantity, span);
+  }
+
+  /** Changes of a parcel's rows between the two flights, null where one isn't known. */
+  function growth(parcel, measure) {
+    const between = pair.of(parcel);
+    return parcel.lines.map((_, row) => (between ? growthOf(parcel.seasons, measure, row, between.from, between.to) : null));
+  }
+
+  function rowHint(parcel, row, measure, change) {
+    const between = pair.of(parcel);
+    const shown = (date) => {
+      const doubt = isDoubtful(parcel.seasons, measure, row, date) ? " ?" : "";
+      return `${number(valueOf(parcel.seasons, measure, row, date), measure.digits)}${doubt} ${measure.unit}`;
+    };
+    if (!between) return about(parcel.parcel, [["Not flown", "on both dates"]]);
+    const dates = [between.from, between.to].map((date) => [parcel.seasons.dates[date].survey ?? "", shown(date)]);
+    const label = parcel.seasons.labels[row].at(-1);
+    return about(`Row ${label}`, [...dates, [measure.title, `${number(change, measure.digits, { signed: true })} ${measure.unit}`]]);
   }
 
   const marked = element("span", { id: "marks", class: "key", hidden: true },
@@ -62,9 +94,10 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
     const colours = quantity.turned ? [...stops(quantity.diverging)].reverse() : stops(quantity.diverging);
     bar.style.background = `linear-gradient(to right, ${colours.join(", ")})`;
     const signed = { signed: Boolean(quantity.diverging) };
-    at("legend").replaceChildren(...(quantity.of ? [
+    at("legend").replaceChildren(...(quantity.of || quantity.measure ? [
       element("span", {}, `${quantity.title}, ${quantity.unit}`),
       element("span", { class: "key" }, number(low, quantity.digits, signed), bar, number(high, quantity.digits, signed)),
+      ...(quantity.measure ? [element("span", { class: "key" }, element("span", { class: "dash unknown" }), "not known on both dates, or not to be trusted")] : []),
     ] : [element("span", {}, "Outlines of the parcels, and their rows")]), marked);
   }
 
@@ -85,10 +118,16 @@ export function showParcels(parcels, rows, [west, south, east, north], selected)
   label();
   let first = true;
   return {
-    select(parcel, changes) {
+    paint,
+    select(parcel) {
+      const { changes } = parcel;
       show = () => {
         marks.clearLayers();
-        const added = (rows[parcel.parcel] ?? []).filter((_, k) => changes?.state[k] === "new");
+        if (QUANTITIES[chosen.value].measure) {
+          at("marks").hidden = true;
+          return;
+        }
+        const added = parcel.lines.filter((_, k) => changes?.state[k] === "new");
         const line = (points, options) => new Polyline(points.map(place), { renderer: canvas, interactive: false, weight: 3, ...options }).addTo(marks);
         for (const points of added) line(points, { color: colour("selected") });
         for (const points of changes?.gone ?? []) line(points, { color: colour("gap"), dashArray: "7 5" });
@@ -108,6 +147,10 @@ function hint(parcel, quantity, value) {
     ["Missing", `${number(parcel.n_missing)} vines`],
     ...(quantity.of ? [[quantity.title, `${number(value, quantity.digits, { signed: Boolean(quantity.diverging) })} ${quantity.unit}`]] : []),
   ];
-  return element("div", {}, element("strong", {}, parcel.parcel),
+  return about(parcel.parcel, lines);
+}
+
+function about(title, lines) {
+  return element("div", {}, element("strong", {}, title),
     element("dl", {}, ...lines.flatMap(([term, shown]) => [element("dt", {}, term), element("dd", {}, shown)])));
 }

@@ -2,6 +2,7 @@
 import { data, unpack, unpackJSON } from "./data.js";
 import { at, choice, element, number } from "./page.js";
 import { showHead, showQuality, showRecord, showUnmapped } from "./words.js";
+import { showDates } from "./dates.js";
 import { measured } from "./line.js";
 import { showMap } from "./map.js";
 import { showPlots } from "./plots.js";
@@ -39,8 +40,9 @@ async function start() {
   at("views").hidden = false;
   const { profiles, terrain } = await unpackJSON("details");
   const step = data.settings?.sections?.step ?? 0.25;
+  const seasons = await unpackJSON("history");
   const table = rowTable(rows, selected);
-  const map = showMap(rows, profiles, selected);
+  const map = showMap(rows, profiles, selected, seasons);
   const plots = showPlots(rows, profiles, step, (row, position) => map.mark(row, position));
   showSteps();
 
@@ -56,6 +58,7 @@ async function start() {
       row.flags ? `odd: ${row.flags}` : "",
     ].filter(Boolean).join(" · ");
   });
+  if (seasons) showDates(rows, seasons, selected);
   const asked = decodeURIComponent(location.hash).match(/^#row-(\d+)$/);
   selected.set(rows.find((row) => row.row_id === Number(asked?.[1])) ?? rows[0]);
   requestAnimationFrame(() => setTimeout(() => done("drawn")));

@@ -1,0 +1,117 @@
+"""What a survey's page tells of a parcel's rows: where they are, what has changed, and their numbers on all dates."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+
+from vinemap.compute.threads import in_threads
+from vinemap.evaluate.changes import GONE, compare_rows, summarise
+from vinemap.geo.crs import WGS84, project
+from vinemap.product.pages.page import polylines
+from vinemap.product.seasons.history import history
+from vinemap.product.seasons.products import read_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import geopandas as gpd
+    from pyproj import CRS
+
+    from vinemap.product.seasons.products import Product
+
+TOLERANCE = 0.2
+"""Metres by which lines on the map may leave rows and outlines."""
+DIGITS = {"length_m": 1, "height_m": 3, "width_m": 3, "volume_m3": 2, "gap_m": 2, "n_missing": 0}
+
+
+def outline_of(product: Product, crs: CRS) -> shapely.Geometry:
+    """A parcel's outline in the CRS of a page; local coordinates as they are."""
+    return product.outline if product.local else project(product.outline, WGS84, crs)
+
+
+def tell_parcel(product: Product, earlier: Sequence[Product], crs: CRS) -> dict[str, Any]:
+    """What is told of a parcel: ``lines`` of its rows about ``zero``, ``told`` (numbers), and ``remarks``.
+
+    With earlier products also ``changes`` since the latest of them and the ``history`` of all, as far as can be told.
+
+    Parameters
+    ----------
+    product : Product
+        The parcel's.
+    earlier : sequence of Product
+        Those of earlier flights, the latest first.
+    crs : CRS
+        That of the page.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on odd files
+        rows, *before = in_threads(lambda one: read_rows(one.folder, one.parcel), (product, *earlier))
+    zero = np.floor(np.nan_to_num(shapely.bounds(outline_of(product, crs))[:2]))
+
+    def drawn(lines: gpd.GeoSeries) -> list[list[list[float]]]:
+        return polylines(lines.to_crs(crs), zero, tolerance=TOLERANCE, digits=1)
+
+    compared = _compare(rows, before[0], earlier[0]) if earlier else {}
+    found: dict[str, Any] = {
+        "zero": zero,
+        "told": _numbers(rows)
+        | {one: compared[one] for one in ("since", "shift", "summary", "remark") if one in compared},
+        "remarks": [] if rows is not None else ["its GeoPackage can't be read"],
+        "lines": [] if rows is None else drawn(rows.geometry),
+    }
+    unread = [one.survey or one.parcel for one, table in zip(earlier[1:], before[1:], strict=True) if table is None]
+    found["remarks"] += [f"its rows of {survey} can't be read" for survey in unread]
+    if "rows" in compared:
+        found["changes"] = compared["rows"] | {"gone": drawn(compared["gone"])}
+    flights = [
+        (one, table) for one, table in zip((product, *earlier), (rows, *before), strict=True) if table is not None
+    ]
+    if rows is not None and len(flights) > 1:
+        try:
+            found["history"] = history(flights, latest=compared.get("all"))
+        except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
+            found["told"].setdefault("remark", f"can't be followed ({type(error).__name__})")
+    return found
+
+
+def _numbers(rows: gpd.GeoDataFrame | None) -> dict[str, Any]:
+    """A parcel's numbers."""
+    if rows is None:
+        return {}
+    length = rows["length_m"].to_numpy(dtype=float)
+    height = rows["height_m"].to_numpy(dtype=float)
+    known = np.isfinite(height)
+    told: dict[str, Any] = {name: float(rows[name].sum()) for name in ("length_m", "volume_m3", "gap_m", "n_missing")}
+    mean = float(np.average(height[known], weights=length[known])) if known.any() else None
+    return told | {"rows": len(rows), "height_m": mean}
+
+
+def _compare(rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
+    """What has changed in a parcel since a product, or why nothing can be said."""
+    told: dict[str, Any] = {
+        "since": {"survey": before.survey, "parcel": before.parcel, "flown": before.flown.isoformat()}
+    }
+    if rows is None or earlier is None:
+        return told | {"remark": f"rows of {'this' if rows is None else 'the earlier'} survey can't be read"}
+    try:
+        changes = compare_rows(rows, earlier)
+    except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
+        return told | {"remark": f"can't be compared ({type(error).__name__})"}
+    table = changes.rows
+    columns: dict[str, Any] = {name: table[name].tolist() for name in ("state", "label", "earlier", "part_of")}
+    for name, digits in DIGITS.items():
+        columns |= {part: np.round(table[part], digits).tolist() for part in (name, f"d_{name}")}
+    share = table["d_volume_m3"] / (table["volume_m3"] - table["d_volume_m3"])
+    columns["d_volume"] = np.round(share, 4).tolist()
+    gone = earlier.geometry[earlier["label"].isin(table.loc[table["state"] == GONE, "earlier"])].to_crs(rows.crs)
+    return told | {
+        "shift": changes.shift,
+        "summary": summarise(changes),
+        "rows": columns,
+        "gone": gone.translate(*changes.shift),
+        "all": changes,
+    }

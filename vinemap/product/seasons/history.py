@@ -1,0 +1,64 @@
+"""The rows of a parcel over all dates on which it was flown, as pages plot them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinemap.evaluate.changes import follow_rows
+from vinemap.product.pages.page import whole_numbers
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import geopandas as gpd
+
+    from vinemap.evaluate.changes import Changes
+    from vinemap.product.seasons.products import Product
+
+UNITS = {"length_m": 0.1, "height_m": 0.01, "width_m": 0.01, "volume_m3": 0.01, "gap_m": 0.1, "n_missing": 1.0}
+"""In how many of its column's units a number is told."""
+DOUBTFUL = 0.5
+"""Confidence in a canopy's numbers below which they are marked."""
+
+
+def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Changes | None = None) -> dict[str, Any]:
+    """Numbers of rows by date.
+
+    Parameters
+    ----------
+    flights : sequence of (Product, GeoDataFrame)
+        Products of a parcel with their rows, the latest first.
+    latest : Changes, optional
+        Those between the first two, where they are known.
+
+    Returns
+    -------
+    dict
+        ``dates``, the oldest first, each with its ``survey``, ``parcel`` and ``flown``. For each row, those of the
+        latest date in their order and then those that are there no more, a list by date, None where it isn't there:
+        ``labels``, what ``units`` has, in these, and ``doubtful``, whether its canopy's numbers are.
+    """
+    tables = [rows for _, rows in flights]
+    numbers = follow_rows(tables, latest=latest)
+    shape = int(max(found.max(initial=-1) for found in numbers)) + 1, len(flights)
+    labels = np.full(shape, None, dtype=object)
+    doubtful = np.zeros(shape, dtype=int)
+    values = {name: np.full(shape, np.nan) for name in UNITS}
+    for k, (table, found) in enumerate(zip(tables, numbers, strict=True)):
+        date = shape[1] - 1 - k
+        labels[found, date] = table["label"]
+        if "canopy_confidence" in table:
+            doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < DOUBTFUL
+        for name, column in values.items():
+            column[found, date] = table[name]
+    return {
+        "dates": [
+            {"survey": one.survey, "parcel": one.parcel, "flown": one.flown.isoformat()} for one, _ in flights[::-1]
+        ],
+        "units": UNITS,
+        "labels": labels.tolist(),
+        "doubtful": doubtful.tolist(),
+        **{name: [whole_numbers(row, unit=UNITS[name]) for row in column] for name, column in values.items()},
+    }
