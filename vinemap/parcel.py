@@ -25,7 +25,8 @@ from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.unmapped import find_unmapped
-from vinemap.geo.crs import check_near, corner_of, project
+from vinemap.geo.crs import project
+from vinemap.geo.main import check_near, corner_of
 from vinemap.geo.raster import grid_over
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer

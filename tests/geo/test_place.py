@@ -104,6 +104,54 @@ def test_a_place_is_one_in_files_and_in_wgs84(tmp_path, crs, lon, lat, kept):
     assert np.allclose(from_wgs84([[*lat_lon, 467.0]], target), there, atol=0.001)
 
 
+OWN_GRID = "+proj=tmerc +lat_0=49 +lon_0=-2 +k=0.9 +x_0=400100 +y_0=0 +ellps=airy +nadgrids={}"
+GRIDS_IN_WKT = 'EXTENSION["PROJ4_GRIDS","nowhere.gsb"],AUTHORITY["EPSG","6277"]'
+
+
+def test_a_grid_that_a_crs_names_and_proj_lacks():
+    may, must = (parse_crs(OWN_GRID.format(grid)) for grid in ("@nowhere.gsb,null", "nowhere.gsb"))
+    (doubt,) = doubts_of(may, 400_000, 300_000)
+    assert doubt.startswith("the accuracy of positions in WGS 84 is not known: PROJ lacks the grid nowhere.gsb for ")
+    with pytest.raises(InputError, match=r"a\.laz: .* can't be brought to WGS 84 without the grid nowhere\.gsb: give"):
+        check_place(must, 400_000, 300_000, "a.laz")
+
+
+def test_a_grid_beside_a_crs_that_proj_knows_does_not_count():
+    """As GDAL writes it."""
+    text = CRS.from_epsg(27700).to_wkt("WKT1_GDAL").replace('AUTHORITY["EPSG","6277"]', GRIDS_IN_WKT)
+    assert doubts_of(CRS.from_wkt(text), 651_410, 313_177) == doubts_of(CRS.from_epsg(27700), 651_410, 313_177)
+
+
+@pytest.mark.parametrize("code", [32600, 3145, 2963])
+def test_a_crs_from_which_no_way_leads(code):
+    with pytest.raises(
+        InputError, match=rf"a\.laz: EPSG:{code} .* can't be brought to WGS 84: give their CRS with --crs"
+    ):
+        check_place(CRS.from_epsg(code), 500_000, 4_900_000, "a.laz")
+
+
+POTSDAM = "+towgs84=598.1,73.7,418.2,0.202,0.045,-2.455,6.7"
+MONTE_MARIO = "+towgs84=-104.1,-49.1,-9.9,0.971,-2.917,0.714,-11.68"
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        (f"+proj=utm +zone=32 +ellps=intl {MONTE_MARIO}", None),
+        (f"+proj=tmerc +lon_0=9 +k=1 +x_0=3500000 +ellps=bessel {POTSDAM}", "DHDN"),
+        (f"+proj=tmerc +lon_0=9 +k=0.9996 +x_0=1500000 +ellps=intl {MONTE_MARIO}", "Monte Mario"),
+        ("+proj=utm +zone=32 +ellps=GRS80 +towgs84=0,0,0", "ETRS89"),
+    ],
+    ids=["not ED50", "not DB_REF", "one alone", "no shift"],
+)
+def test_of_crss_with_the_same_numbers_the_shift_tells_which(text, kept):
+    crs = CRS.from_wkt(parse_crs(text).to_wkt("WKT1_GDAL"))
+    flat = horizontal(crs)
+    assert flat.is_bound if kept is None else flat.name.startswith(kept)
+    x, y = Transformer.from_crs(4326, crs, always_xy=True).transform(9.0, 46.0)
+    assert not doubts_of(crs, x, y) or "elsewhere" not in doubts_of(crs, x, y)[-1]
+
+
 SWAPPED, TURNED, LOCAL_ONES = "x and y seem to be swapped:", "their signs seem to be turned", "seem to be local metres"
 
 
@@ -151,6 +199,11 @@ def test_coordinates_outside_their_crs_are_refused(code, x, y, reason):
 def test_coordinates_within_or_beside_their_crs_pass(text, lon, lat):
     crs = parse_crs(text)
     check_place(crs, *on(crs, lon, lat), "a.laz")
+
+
+def test_a_local_crs_that_a_file_states_is_told():
+    (doubt,) = doubts_of(CRS.from_wkt('LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]'), 3.0, 4.0)
+    assert doubt.startswith("'Local Coordinates (m)' has no place on the globe")
 
 
 def test_local_coordinates_have_no_place():

@@ -61,6 +61,8 @@ UTM, STATE_PLANE = {1024: 1, 3072: 26910}, {1024: 1, 3072: 2226}
         (UTM | {4096: 5703, 4099: 9003}, FOOT, "NAVD88 height"),
         (UTM | {4096: 5103, 4099: 9001}, 1.0, "NAVD88 height"),
         (UTM | {4096: 5030}, 1.0, "ellipsoidal height"),
+        (UTM | {4096: 4979}, 1.0, "ellipsoidal height"),
+        (UTM | {4096: 32767, 4098: 5171}, 1.0, "EGM96 geoid"),
         (UTM | {4096: 32767, 4099: 9003}, FOOT, None),
         (STATE_PLANE, FOOT, None),
         (STATE_PLANE | {4096: 5703}, 1.0, "NAVD88 height"),
@@ -87,6 +89,59 @@ def test_a_datum_in_words_is_kept(tmp_path, points):
     cloud = read_cloud(write(tmp_path / "a.laz", points / [1, 1, FOOT] + NAPA, keys=keys, ascii_keys=texts))
     assert cloud.vertical == "NAVD88 (Geoid18)"
     assert np.allclose(cloud.extent[1][2], points[:, 2].max(), atol=0.002)
+
+
+@pytest.mark.parametrize("text", ["NAD83 / UTM zone 10N", "ESRI PE String = " + CRS(26910).to_wkt("WKT1_ESRI")])
+@pytest.mark.parametrize("keys", [{2048: 4269}, {}])
+def test_a_projected_crs_in_words(tmp_path, points, text, keys):
+    path = write(tmp_path / "a.laz", points + NAPA, keys={1024: 1, 3072: 32767} | keys, ascii_keys={3073: text})
+    assert read_cloud(path).crs.to_epsg() == 26910
+
+
+@pytest.mark.parametrize("text", ["a grid of our own", ""])
+def test_a_projected_crs_in_words_that_nobody_knows(tmp_path, points, text):
+    """Its geographic CRS isn't that of the coordinates."""
+    keys, words = {1024: 1, 2048: 4269, 3072: 32767}, {3073: text} if text else {}
+    with pytest.raises(InputError, match="states no CRS for its coordinates"):
+        read_cloud(write(tmp_path / "a.laz", points + NAPA, keys=keys, ascii_keys=words))
+
+
+@pytest.mark.parametrize(
+    ("code", "metres"), [(26911, r"5\d\d,\d\d\d"), (26710, r"\d\d\d"), (6339, None), (32610, None)]
+)
+def test_two_crss_of_one_file_must_lead_to_one_place(tmp_path, points, code, metres):
+    path = write(tmp_path / "a.laz", points + NAPA, keys=UTM, wkt=CRS(code).to_wkt("WKT1_GDAL"))
+    if not metres:
+        assert read_cloud(path).crs.to_epsg() == code
+        return
+    with pytest.raises(
+        InputError, match=rf"a\.laz: states two CRSs that lie {metres} m apart, .* in WKT and NAD83 / UTM"
+    ):
+        read_cloud(path)
+    assert read_cloud(path, crs=CRS(26910)).crs.to_epsg() == 26910
+
+
+LOCAL_WKT = {
+    "metres": 'LOCAL_CS["site",UNIT["metre",1]]',
+    "with heights": 'ENGCRS["site",EDATUM["site"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'
+    'LENGTHUNIT["metre",1]]',
+    "feet": 'LOCAL_CS["site",UNIT["foot",0.3048]]',
+    "depths": f'COMPD_CS["site",{CRS(26910).to_wkt("WKT1_GDAL")},VERT_CS["d",VERT_DATUM["d",2005],UNIT["m",1],'
+    'AXIS["Depth",DOWN]]]',
+}
+
+
+@pytest.mark.parametrize("kind", LOCAL_WKT)
+def test_local_coordinates_by_the_file(tmp_path, points, kind):
+    path = write(tmp_path / "a.laz", points + NAPA * (kind == "depths"), wkt=LOCAL_WKT[kind])
+    refused = {"feet": "site is local, and not in metres", "depths": "heights of site count downwards"}
+    if kind in refused:
+        with pytest.raises(InputError, match=rf"a\.laz: {refused[kind]}"):
+            read_cloud(path)
+        return
+    cloud = read_cloud(path)
+    assert np.allclose(cloud.xyz, points, atol=0.0006)
+    assert cloud.vertical is None
 
 
 def test_heights_are_the_files_where_the_given_crs_tells_of_none(tmp_path, points):

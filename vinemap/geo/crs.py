@@ -19,8 +19,6 @@ from vinemap.errors import ConfigError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from vinemap.compute.arrays import Floats
-    from vinemap.geo.raster import Raster
 
 WGS84 = CRS.from_epsg(4326)
 LOCAL = CRS.from_wkt(
@@ -35,6 +33,8 @@ SAME = 0.001
 """Metres within which coordinates are the same."""
 SAME_DEGREES = 1e-7
 """The same, of places: a centimetre."""
+LIKELY = 70
+"""Confidence, of 100, with which PROJ knows a CRS by its numbers alone."""
 SCALE_TOLERANCE = 0.002
 """A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
 
@@ -98,16 +98,20 @@ def parse_crs(text: str) -> CRS:
     return check_horizontal(crs)
 
 
-def check_horizontal(crs: CRS) -> CRS:
+def check_horizontal(crs: CRS, of: str = "") -> CRS:
     """Return a CRS that places points on the map: projected, geographic or local, with heights or not.
 
     Raises
     ------
     InputError
-        If it does none of that (geocentric, vertical alone).
+        If it does none of that (geocentric, vertical alone), or can't be used; ``of`` tells whose it is.
     """
     if not (crs.is_projected or crs.is_geographic or is_local(crs)):
-        raise InputError(f"{crs.name} is neither projected nor geographic: give the cloud's CRS with --crs EPSG:n")
+        raise InputError(f"{of}{crs.name} is neither projected nor geographic: give the cloud's CRS with --crs EPSG:n")
+    if is_local(crs) and crs.axis_info[0].unit_conversion_factor != 1.0:
+        raise InputError(f"{of}{crs.name} is local, and not in metres: export the cloud in metres")
+    if any(axis.direction == "down" for axis in (vertical(crs) or crs).axis_info):
+        raise InputError(f"{of}heights of {crs.name} count downwards: export the cloud with z upwards")
     return crs
 
 
@@ -124,7 +128,7 @@ def horizontal(crs: CRS) -> CRS:
     by its code, and means there what PROJ makes of it.
     """
     flat = stated(crs)
-    code = _stated_code(unbound(flat)) or code_of(unbound(flat)) if flat.is_bound else None
+    code = _stated_code(unbound(flat)) or _code_beside(flat) if flat.is_bound else None
     return CRS.from_authority(*code) if code else flat
 
 
@@ -143,19 +147,48 @@ def _stated_code(crs: CRS) -> tuple[str, str] | None:
     code = [str(part) for part in (crs.to_json_dict().get("id") or {}).values()]
     try:
         known = CRS.from_authority(*code) if len(code) == 2 else None
-        if known is None or (area := known.area_of_use) is None:
+        if known is None or (middle := _middle(known)) is None:
             return None
-        middle = (area.west + area.east) / 2, (area.south + area.north) / 2
         there, here = (transformer(known.geodetic_crs, one).transform(*middle) for one in (known, crs))
     except (CRSError, ProjError):
         return None
     return (code[0], code[1]) if np.allclose(there, here, rtol=0, atol=SAME) else None
 
 
+def _code_beside(bound: CRS) -> tuple[str, str] | None:
+    """Authority and code of the CRS that a shift stands beside, by its name and numbers.
+
+    Numbers alone may be those of several, of different datums: then of the one to which the shift leads, too.
+    """
+    crs = unbound(bound)
+    likely = [(match.auth_name, match.code, match.confidence) for match in crs.list_authority(min_confidence=LIKELY)]
+    best = [(authority, code) for authority, code, sure in likely if sure == max(one[2] for one in likely)]
+    if len(best) < 2:
+        return code_of(crs)
+    return next((code for code in best if _leads(bound, CRS.from_authority(*code))), None)
+
+
+def _leads(bound: CRS, known: CRS) -> bool:
+    """Whether a shift leads to where PROJ has a CRS."""
+    try:
+        middle = _middle(known)
+        x, y = transformer(known.geodetic_crs, known).transform(*middle) if middle else (np.nan, np.nan)
+        there, here = (transformer(one, WGS84).transform(x, y) for one in (known, bound))
+    except ProjError:
+        return False
+    return bool(np.allclose(there, here, rtol=0, atol=SAME_DEGREES))
+
+
+def _middle(known: CRS) -> tuple[float, float] | None:
+    """Degrees in the middle of where a CRS is used."""
+    area = known.area_of_use
+    return ((area.west + area.east) / 2, (area.south + area.north) / 2) if area else None
+
+
 @lru_cache(maxsize=32)
 def code_of(crs: CRS) -> tuple[str, str] | None:
     """Authority and code by which a CRS is known, as ("EPSG", "32632")."""
-    code: tuple[str, str] | None = crs.to_authority(min_confidence=70)
+    code: tuple[str, str] | None = crs.to_authority(min_confidence=LIKELY)
     return code
 
 
@@ -168,7 +201,7 @@ def vertical_name(crs: CRS) -> str | None:
     """Name of the vertical datum that a CRS states, as it is called where heights are in metres, or None."""
     if up := vertical(crs):
         return None if up.name == UNKNOWN else _in_metres(up.name)
-    return ELLIPSOIDAL if len(crs.axis_info) > 2 else None
+    return ELLIPSOIDAL if len(crs.axis_info) > 2 and not is_local(crs) else None
 
 
 @lru_cache(maxsize=32)
@@ -312,32 +345,3 @@ def to_main(xyz: ArrayLike, crs: CRS, origin: Origin | Corner) -> NDArray[np.flo
         moved: NDArray[np.float64] = np.atleast_2d(np.asarray(xyz, dtype=float)) - np.array(origin)
         return moved
     return wgs84_to_main(to_wgs84(xyz, crs), origin)
-
-
-FARTHEST = 50_000.0
-"""Metres from the origin of {Main}, a plane that the globe leaves by then."""
-
-
-def corner_of(dtm: Raster) -> Origin | Corner:
-    """Origin of {Main} where none is given: the south-western corner of the terrain, at its lowest elevation."""
-    grid = dtm.grid
-    south = grid.north - grid.ny * grid.resolution
-    corner = Corner(grid.west, south, float(np.floor(np.nanmin(dtm.values))))
-    if is_local(dtm.crs):
-        return corner
-    lat, lon, alt = to_wgs84(corner, dtm.crs)[0]
-    return Origin(round(float(lat), 9), round(float(lon), 9), float(alt))
-
-
-def check_near(origin: Origin, point: Floats, crs: CRS) -> None:
-    """Make sure that an origin of {Main} lies near the cloud, one point (3,) of which is given.
-
-    Raises
-    ------
-    InputError
-        If it doesn't.
-    """
-    if is_local(crs):
-        raise InputError("local coordinates have no latitude and longitude: leave the origin out")
-    if np.abs(to_main(point[None], crs, origin)[0, :2]).max() > FARTHEST:
-        raise InputError(f"origin {origin.lat:g}, {origin.lon:g} is over 50 km from the cloud: latitude comes first")

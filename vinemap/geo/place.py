@@ -11,7 +11,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import WGS84, code_of, horizontal, is_local, stated, transformer
+from vinemap.geo.crs import LOCAL, WGS84, code_of, horizontal, is_local, stated, transformer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +31,9 @@ SAME = 0.01
 """Metres within which two places are the same."""
 GLOBE = 6_371_000.0
 """Metres of its radius."""
+UNSURE = "the accuracy of positions in WGS 84 is not known"
+GIVE = "give their CRS with --crs EPSG:n"
+"""What to do with coordinates of a cloud that aren't of its CRS."""
 
 
 class Place(NamedTuple):
@@ -42,7 +45,7 @@ class Place(NamedTuple):
     """A sentence each; whole when all points were read."""
 
 
-def check_place(crs: CRS, x: float, y: float, of: str) -> None:
+def check_place(crs: CRS, x: float, y: float, of: str, *, remedy: str = GIVE) -> None:
     """Make sure that a point lies where its CRS is used.
 
     Parameters
@@ -53,18 +56,27 @@ def check_place(crs: CRS, x: float, y: float, of: str) -> None:
         The point, x east.
     of : str
         Whose coordinates they are.
+    remedy : str
+        What to do if they aren't of that CRS.
 
     Raises
     ------
     InputError
-        If it doesn't, with what the reason may be.
+        If it doesn't, with what the reason may be, or there is no way from that CRS to WGS 84.
     """
     flat = horizontal(crs)
     area = _area(flat)
-    if is_local(flat) or area is None:
+    if is_local(flat):
+        return
+    try:
+        transformer(flat, WGS84).transform(x, y)
+    except ProjError as error:
+        why = f" without the grid {lacks}" if (lacks := _lacking(flat)) else ""
+        raise InputError(f"{of}: {_called(flat)} can't be brought to WGS 84{why}: {remedy}") from error
+    if area is None:
         return
     if _is_near_zero(flat, area, x, y):
-        reason = "they seem to be local metres: give their CRS with --crs EPSG:n, or --crs local"
+        reason = f"they seem to be local metres: {remedy}{', or --crs local' if remedy == GIVE else ''}"
     elif _holds(area, *_lon_lat(flat, x, y)):
         return
     else:
@@ -78,7 +90,7 @@ def check_place(crs: CRS, x: float, y: float, of: str) -> None:
         }
         right = (way for way, other in ways.items() if _holds(area, *_lon_lat(flat, *other), margin=0.0))
         reason = next(right, "perhaps they are swapped, negated, local or in another unit")
-        reason = f"{reason}: give their CRS with --crs"
+        reason = f"{reason}: {remedy}"
     raise InputError(
         f"{of}: coordinates ({x:.2f}, {y:.2f}) lie outside the area of {_called(flat)}, "
         f"{area.west:g} to {area.east:g}° E, {area.south:g} to {area.north:g}° N: {reason}"
@@ -89,21 +101,25 @@ def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
     """What is to be known of the way from a CRS to WGS 84 near a point (x east): a sentence each."""
     flat = horizontal(crs)
     if is_local(flat):
-        return []
+        known = f"{flat.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
+        return [] if flat == LOCAL else [known]
     return [*_roughness(flat, x, y), *_other_shift(stated(crs), flat, x, y)]
 
 
 def _roughness(flat: CRS, x: float, y: float) -> list[str]:
     """Whether PROJ knows a place in WGS 84 less well than it could, or than matters."""
     lon, lat = _lon_lat(flat, x, y)
-    if flat.is_bound or not (np.isfinite(lon) and np.isfinite(lat)):
+    if flat.is_bound:
+        lacks = _lacking(flat)
+        return [f"{UNSURE}: PROJ lacks the grid {lacks} for {_called(flat)}"] if lacks else []
+    if not (np.isfinite(lon) and np.isfinite(lat)):
         return []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of grids that are missing
         near = AreaOfInterest(lon, lat, lon, lat)
         group = TransformerGroup(flat, WGS84, always_xy=True, area_of_interest=near)
     metres = _accuracy(flat, x, y)
-    known = "the accuracy of positions in WGS 84 is not known"
+    known = UNSURE
     if metres >= 0:
         known = f"positions in WGS 84 are good to {metres:g} m only"
     if not group.best_available and group.unavailable_operations:
@@ -114,6 +130,13 @@ def _roughness(flat: CRS, x: float, y: float) -> list[str]:
     if metres > ROUGH or metres < 0:
         return [f"{known}: PROJ knows no better way there from {_called(flat)}"]
     return []
+
+
+def _lacking(flat: CRS) -> str:
+    """Which grids a CRS names itself for its way to WGS 84, and PROJ lacks."""
+    grids = flat.coordinate_operation.grids if flat.is_bound and flat.coordinate_operation else []
+    lacking = (grid.short_name.lstrip("@") for grid in grids if not grid.available)
+    return ", ".join(name for name in lacking if name != "null")
 
 
 def _accuracy(flat: CRS, x: float, y: float) -> float:
@@ -128,16 +151,17 @@ def _accuracy(flat: CRS, x: float, y: float) -> float:
 
 def _other_shift(bound: CRS, flat: CRS, x: float, y: float) -> list[str]:
     """Whether a shift that is stated beside a CRS, and doesn't count, leads elsewhere."""
-    if bound == flat:
-        return []
-    (lon, other), (lat, beside) = zip(
-        transformer(flat, WGS84).transform(x, y), transformer(bound, WGS84).transform(x, y), strict=True
-    )
-    way = np.radians([(other - lon) * np.cos(np.radians(lat)), beside - lat])
-    metres = float(GLOBE * np.hypot(*way))
-    if not metres > SAME:
+    if bound == flat or _lacking(bound) or not (metres := apart(flat, bound, x, y)) > SAME:
         return []
     return [f"the TOWGS84 beside {_called(flat)} leads {metres:.2f} m elsewhere; what PROJ knows of that CRS counts"]
+
+
+def apart(one: CRS, other: CRS, x: float, y: float) -> float:
+    """Metres between the places to which two CRSs lead from a point (x east); NaN where one has none."""
+    (lon, lon2), (lat, lat2) = zip(_lon_lat(horizontal(one), x, y), _lon_lat(stated(other), x, y), strict=True)
+    with np.errstate(invalid="ignore"):
+        way = np.radians([((lon2 - lon + 180) % 360 - 180) * np.cos(np.radians(lat)), lat2 - lat])
+        return float(GLOBE * np.hypot(*way))
 
 
 def _in_other_unit(flat: CRS, x: float, y: float) -> dict[str, tuple[float, float]]:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pyproj import CRS
-from pyproj.crs import CompoundCRS
+from pyproj.crs import CompoundCRS, Datum  # type: ignore[attr-defined]  # stubs have it in a private module
 from pyproj.database import get_units_map
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from vinemap.errors import InputError
 from vinemap.geo.crs import (
@@ -19,11 +19,12 @@ from vinemap.geo.crs import (
     horizontal,
     is_local,
     stated,
+    transformer,
     vertical,
     vertical_name,
     vertical_unit,
 )
-from vinemap.geo.place import check_place, doubts_of
+from vinemap.geo.place import apart, check_place, doubts_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,8 +32,14 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Floats
     from vinemap.geo.place import Place
 
-VERTICAL, CITATION, VERTICAL_UNIT = 4096, 4097, 4099
-"""GeoTIFF's keys of a vertical CRS, of what it is called, and of the unit of heights."""
+VERTICAL, CITATION, DATUM, VERTICAL_UNIT = 4096, 4097, 4098, 4099
+"""GeoTIFF's keys of a vertical CRS, of what it is called, of its datum, and of the unit of heights."""
+MODEL, PROJECTED, CITATIONS = 1024, 1, (3073, 1026)
+"""GeoTIFF's key of the kind of coordinates, its value for projected ones, and keys of what their CRS is called."""
+ESRI = "ESRI PE String = "
+"""What stands before WKT in the place of a name."""
+OTHER_PLACE = 5.0
+"""Metres that two realizations of a datum aren't apart."""
 ELLIPSOIDS, DATUMS = range(5001, 5100), range(5101, 5200)
 """Codes that GeoTIFF 1.0 has for heights above an ellipsoid, and above a datum whose CRS has a code 600 higher."""
 HEIGHTS = 'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["up",up],LENGTHUNIT["unit",{!r}]]'
@@ -60,8 +67,10 @@ def crs_of(header: Any, given: CRS | None, path: Path) -> CRS:
         If there is none, or it can't be used.
     """
     try:
-        plain: CRS | None = given or header.parse_crs()
+        plain = given or _horizontal(header, path)
         up = _vertical(header)
+    except InputError:
+        raise
     except Exception as error:
         if given:
             return check_horizontal(given)
@@ -69,9 +78,42 @@ def crs_of(header: Any, given: CRS | None, path: Path) -> CRS:
         raise InputError(f"{path}: its CRS can't be understood ({reason}): give it with --crs EPSG:n") from error
     if plain is None:
         raise InputError(f"{path}: states no CRS for its coordinates: give it with {_hint(header)}")
+    plain = check_horizontal(plain, f"{path}: ")
     if up is None or plain.is_compound or len(plain.axis_info) > 2 or is_local(plain):
-        return check_horizontal(plain)
-    return CompoundCRS(f"{plain.name} + {up.name}", [stated(check_horizontal(plain)), up])
+        return plain
+    return check_horizontal(CompoundCRS(f"{plain.name} + {up.name}", [stated(plain), up]), f"{path}: ")
+
+
+def _horizontal(header: Any, path: Path) -> CRS | None:
+    """The CRS that a header states, in WKT or in GeoTIFF keys; where it does both, they must lead to one place."""
+    text: CRS | None = header.parse_crs()
+    codes: CRS | None = header.parse_crs(prefer_wkt=False)
+    records = _records(header)
+    if (codes is None or codes.is_geographic) and MODEL in (keys := _keys(records)):
+        own = keys[MODEL].value_offset == PROJECTED
+        text, codes = (_named(records, keys) if own and crs == codes else crs for crs in (text, codes))
+    if text is None or codes is None or text == codes:
+        return text or codes
+    x, y = ((header.mins + header.maxs)[:2] / 2).tolist()
+    if (metres := apart(text, codes, x, y)) > OTHER_PLACE:
+        raise InputError(
+            f"{path}: states two CRSs that lie {metres:,.0f} m apart, {text.name} in WKT and {codes.name} in GeoTIFF "
+            "keys: say with --crs EPSG:n which is right"
+        )
+    return text
+
+
+def _named(records: list[Any], keys: dict[int, Any]) -> CRS | None:
+    """The projected CRS that GeoTIFF keys tell in words alone: by its name, or in the WKT of Esri."""
+    for key in CITATIONS:
+        words = _citation(records, keys, key)
+        try:
+            crs = CRS.from_user_input(words.removeprefix(ESRI))
+        except CRSError:
+            continue
+        if crs.is_projected and (crs.name == words or words.startswith(ESRI)):
+            return crs
+    return None
 
 
 def _hint(header: Any) -> str:
@@ -80,24 +122,34 @@ def _hint(header: Any) -> str:
     return f"--crs {'EPSG:4326, as they look like degrees' if degrees else 'EPSG:n, or local if they are local metres'}"
 
 
+def _records(header: Any) -> list[Any]:
+    """Those of a header that tell of coordinates."""
+    return [*header.vlrs.get_by_id("LASF_Projection"), *(header.evlrs or ())]
+
+
+def _keys(records: list[Any]) -> dict[int, Any]:
+    """GeoTIFF keys by their numbers."""
+    return {key.id: key for record in records for key in getattr(record, "geo_keys", ())}
+
+
 def _vertical(header: Any) -> CRS | None:
     """The vertical CRS that a header states, in WKT or in GeoTIFF keys."""
-    records = [*header.vlrs.get_by_id("LASF_Projection"), *(header.evlrs or ())]
+    records = _records(header)
     for text in filter(None, (getattr(record, "string", "") for record in records)):
         try:
             if up := vertical(CRS.from_wkt(text)):
                 return up
         except CRSError:
             continue  # of a file whose CRS is given
-    keys = {key.id: key for record in records for key in getattr(record, "geo_keys", ())}
-    code, unit = (keys[key].value_offset if key in keys else 0 for key in (VERTICAL, VERTICAL_UNIT))
+    keys = _keys(records)
+    code, datum, unit = (keys[key].value_offset if key in keys else 0 for key in (VERTICAL, DATUM, VERTICAL_UNIT))
     metres = _units().get(unit)
-    if code in ELLIPSOIDS:
+    if code in ELLIPSOIDS or _is_geographic(code):
         return CRS.from_wkt(HEIGHTS.format(ELLIPSOIDAL, ELLIPSOIDAL, metres or 1.0))
     known = _vertical_of(code + 600 if code in DATUMS else code)
     if known and metres in (None, known.axis_info[0].unit_conversion_factor):
         return known
-    name = known.name if known else _citation(records, keys)
+    name = known.name if known else _citation(records, keys, CITATION) or _datum(datum) or UNKNOWN
     return CRS.from_wkt(HEIGHTS.format(name, name, metres or 1.0)) if metres or name != UNKNOWN else None
 
 
@@ -109,13 +161,29 @@ def _vertical_of(code: int) -> CRS | None:
     return crs if crs.is_vertical and not crs.is_compound else None
 
 
-def _citation(records: list[Any], keys: dict[int, Any]) -> str:
-    """What GeoTIFF keys call heights in words."""
+def _is_geographic(code: int) -> bool:
+    """Whether a code is one of latitude, longitude and height above an ellipsoid."""
+    try:
+        return len(CRS.from_epsg(code).axis_info) > 2
+    except CRSError:
+        return False
+
+
+def _datum(code: int) -> str:
+    """Name of a vertical datum; nothing if it is none."""
+    try:
+        return Datum.from_epsg(code).name.replace('"', "")
+    except CRSError:
+        return ""
+
+
+def _citation(records: list[Any], keys: dict[int, Any], number: int) -> str:
+    """What GeoTIFF keys call something in words; nothing if they don't."""
     words = b"".join(record.record_data_bytes() for record in records if getattr(record, "strings", None))
-    if (key := keys.get(CITATION)) is None:
-        return UNKNOWN
-    text = words[key.value_offset : key.value_offset + key.count].decode("ascii", "ignore")
-    return text.strip("|\0 ").replace('"', "") or UNKNOWN
+    if (key := keys.get(number)) is None:
+        return ""
+    text = words[key.value_offset : key.value_offset + key.count].decode("ascii", "ignore").strip("|\0 ")
+    return text.replace('"', "") if number == CITATION else text
 
 
 @lru_cache(maxsize=1)
@@ -137,6 +205,26 @@ def check_heights(source: CRS, place: Place, path: Path, first: Path) -> None:
             f"{path}: its heights are above {vertical or 'no datum that it states'}, those of {first.name} above "
             f"{place.vertical or 'none'}: say with --crs EPSG:n+m what all are"
         )
+
+
+def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) -> Floats:
+    """Points (n, 3) of a file, which are changed, in metres of the place of the first; without those that have none.
+
+    Raises
+    ------
+    InputError
+        If there is no way from one's CRS to the other's, or their heights don't go together.
+    """
+    flat, target = horizontal(source), place.crs
+    if flat != target:
+        try:
+            xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
+        except ProjError as error:
+            raise InputError(f"{path}: {flat.name} can't be brought to {target.name}, that of {first.name}") from error
+        xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    check_heights(source, place, path, first)
+    xyz[:, 2] *= vertical_unit(source)
+    return xyz
 
 
 def examined(xyz: Floats, header: Any, source: CRS, path: Path) -> list[str]:
