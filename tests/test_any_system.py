@@ -158,6 +158,14 @@ def test_paths_of_windows_in_yaml(tmp_path, path, quoted):
     assert (str(config.cloud), str(config.boundaries)) == (path, path)
 
 
+@pytest.mark.parametrize("same", [False, True])
+def test_names_on_a_disk_that_takes_capitals_for_small_letters(tmp_path, same):
+    """As one of a network does on Linux, too; the lock that a job holds tells."""
+    for name in (".lock", ".LOCK")[: 1 + same]:
+        (tmp_path / name).touch()
+    assert (paths.alike(tmp_path / "North") == paths.alike(tmp_path / "north")) == (same or sys.platform != "linux")
+
+
 def test_a_path_of_more_than_260_characters(tmp_path):
     folder = tmp_path / ("a" * 150) / ("b" * 150) / "North"
     layer = gpd.GeoDataFrame({"row_id": [1]}, geometry=gpd.points_from_xy([1], [2]), crs=32632)

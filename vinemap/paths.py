@@ -17,7 +17,7 @@ MOST_BYTES = 160
 """Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
 FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%(?=[0-9a-fA-F]{2})')
 """What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
-DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
+DEVICES = re.compile(r"(con(in\$|out\$)?|prn|aux|nul|(com|lpt)[\d¹²³]) *(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
@@ -120,8 +120,13 @@ def product_folder(survey: str, parcel: str) -> Path:
 
 
 def alike(folder: Path) -> Path:
-    """A folder as systems tell it from others, some of which take small letters and capitals for the same."""
-    return folder.with_name(folder.name.casefold()) if sys.platform in ("win32", "darwin") else folder
+    """A folder as its disk tells it from others: some take small letters and capitals for the same.
+
+    A disk that does has the lock of the folder above under another name, too, while that is held.
+    """
+    held = lock(folder.parent)
+    same = sys.platform in ("win32", "darwin") or os.path.exists(held.with_name(held.name.upper()))  # noqa: PTH110
+    return folder.with_name(folder.name.casefold()) if same else folder
 
 
 def parcel_folder(products: Path, parcel: str) -> Path:

@@ -98,6 +98,9 @@ def test_good_names(name):
     [
         ("123/4", "123-4"),
         ("CON", "_CON"),
+        ("com¹", "_com¹"),
+        ("Nul .gpkg", "_Nul .gpkg"),
+        ("CONIN$", "_CONIN$"),
         (".hidden", "hidden"),
         ("a%20b", "a-20b"),
         ("Go!", "Go-"),

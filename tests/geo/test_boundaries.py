@@ -1,13 +1,15 @@
 """Polygons of parcels, as people's files have them."""
 
 import zipfile
+from pathlib import Path
 
 import geopandas as gpd
 import pytest
 import shapely
+from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.geo.boundaries import NoAreaError, read_boundary, read_parcel, read_parcels
+from vinemap.geo.boundaries import NoAreaError, boundary_in, read_boundary, read_parcel, read_parcels
 from vinemap.geo.crs import LOCAL
 
 
@@ -170,6 +172,32 @@ def test_kml_with_folders(tmp_path, packed):
     assert len(found) == 3
 
 
+def test_all_files_in_a_kmz_count(tmp_path):
+    """GDAL reads the first of them alone."""
+    rings = [RING.format(f"{k},0,0 {k}.9,0,0 {k}.9,1,0 {k},1,0 {k},0,0") for k in range(2)]
+    with zipfile.ZipFile(tmp_path / "b.kmz", "w") as target:
+        for name, ring in zip(("doc", "files/more"), rings, strict=True):
+            place = f"<Placemark><name>{name}</name>{ring}</Placemark>"
+            target.writestr(
+                f"{name}.kml", f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{place}</Document></kml>'
+            )
+    found = read_parcels(tmp_path / "b.kmz")
+    assert {name: one.boundary[0].bounds[0] for name, one in found.items()} == {"doc": 0.0, "files/more": 1.0}
+
+
+@pytest.mark.parametrize("kind", ["Unknown", "GeometryCollection"])
+def test_a_layer_that_may_hold_polygons_is_not_passed_over(tmp_path, kind):
+    """Beside one that does by its kind."""
+    path = tmp_path / "b.gpkg"
+    tables = {"parcels": shapely.box(0, 0, 1, 1), "houses": shapely.box(2, 0, 3, 1)}
+    for layer, square in tables.items():
+        one = gpd.GeoDataFrame({"name": [layer]}, geometry=[shapely.GeometryCollection([square])], crs=32632)
+        one = one if layer == "parcels" else one.set_geometry([square], crs=32632)
+        one.to_file(path, layer=layer, geometry_type=kind if layer == "parcels" else None)
+    with pytest.raises(InputError, match=r"several layers of polygons \(houses, parcels\): save the parcels' alone"):
+        read_boundary(path)
+
+
 @pytest.mark.parametrize("folder", ["", "Parcels 2026/"])
 def test_a_zipped_shapefile(tmp_path, folder):
     _, squares = polygons(tmp_path / "b.shp", name=["A", "B"])
@@ -211,7 +239,61 @@ def test_spikes_of_boundaries_are_no_part_of_them(tmp_path, n):
     assert found.equals(shapely.union_all([shapely.box(10 * k, 10 * k, 10 * k + 1, 10 * k + 1) for k in range(n)]))
 
 
+LOOP = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 1), (3, 1), (3, 3), (-1, 3), (-1, -1), (0, -1)]
+BOW, EIGHT = [(0, 0), (1, 1), (1, 0), (0, 1)], [(0, 0), (1, 1), (2, 0), (2, 2), (1, 1), (0, 2)]
+
+
+@pytest.mark.parametrize(("ring", "area", "told"), [(LOOP, 20.0, True), (BOW, 0.5, True), (EIGHT, 2.0, False)])
+def test_an_outline_that_crosses_itself_loses_nothing_and_is_told(tmp_path, ring, area, told):
+    """What it goes round twice isn't outside of it."""
+    gpd.GeoDataFrame({"name": ["A"]}, geometry=[shapely.Polygon(ring)], crs=32632).to_file(tmp_path / "b.gpkg")
+    found = read_parcel(tmp_path / "b.gpkg")
+    assert found.boundary[0].area == pytest.approx(area)
+    assert found.remarks == ("the boundary's outline crosses itself: is all of the parcel within it?",) * told
+
+
+def test_overlapping_parts_of_a_parcel_are_one_area(tmp_path):
+    parts = shapely.MultiPolygon([shapely.box(0, 0, 2, 1), shapely.box(1, 0, 3, 1)])
+    gpd.GeoDataFrame({"name": ["A"]}, geometry=[parts], crs=32632).to_file(tmp_path / "b.gpkg")
+    assert read_boundary(tmp_path / "b.gpkg")[0].area == pytest.approx(3.0)
+
+
+def test_coordinates_that_are_no_numbers_cost_their_parcel_alone(tmp_path):
+    squares = [shapely.box(0, 0, 7, 8), shapely.box(0, 0, 1, 1)]
+    path = tmp_path / "b.geojson"
+    gpd.GeoDataFrame({"name": ["A", "B"]}, geometry=squares, crs=4326).to_file(path)
+    path.write_text(path.read_text().replace("7.0, 8.0", "NaN, 8.0"))
+    found = read_parcels(path)
+    assert "has coordinates that are no numbers" in str(found["A"])
+    assert found["B"].boundary[0].area == 1.0
+
+
+def test_numbers_too_large_to_count_are_names(tmp_path):
+    path, squares = polygons(tmp_path / "b.gpkg", id=[1e20, 2e20])
+    assert [
+        one.boundary[0].equals(square) for one, square in zip(read_parcels(path).values(), squares, strict=True)
+    ] == [
+        True,
+        True,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("polygon", "crs", "told"),
+    [
+        (shapely.box(414_735, 4_940_765, 414_765, 4_940_795), 4326, "lie outside the area of EPSG:4326"),
+        (shapely.box(7.92, 44.61, 7.93, 44.62), 32600, "can't be brought to"),
+    ],
+)
+def test_a_boundary_of_another_crs_than_it_says(polygon, crs, told):
+    with pytest.raises(InputError, match=told) as error:
+        boundary_in((polygon, CRS(crs)), CRS(32632), Path("a.laz"))
+    assert "\n" not in str(error.value)
+
+
 def test_boundaries_that_are_none(tmp_path):
+    with pytest.raises(InputError, match="is a folder: name the file of polygons in it"):
+        read_boundary(tmp_path)
     with pytest.raises(InputError, match="no such file"):
         read_boundary(tmp_path / "none.gpkg")
     text = tmp_path / "b.gpkg"

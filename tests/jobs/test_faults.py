@@ -575,7 +575,7 @@ def test_polygons_that_cannot_be_brought_to_the_cloud(job, tmp_path):
     write_polygons(job.boundaries, polygons, crs=4326)
     outcomes = job.run()
     assert {parcel: one.state for parcel, one in outcomes.items()} == {"A": DONE, "x": FAILED, "B": DONE, "C": DONE}
-    assert "check its CRS" in outcomes["x"].reason
+    assert "save it with its CRS" in outcomes["x"].reason
     points = read_cloud(job.cloud).xyz
     for k, parcel in enumerate("ABC"):
         inside = shapely.contains_xy(square(k), *points[:, :2].T).sum()

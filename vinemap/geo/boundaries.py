@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import difflib
 import unicodedata
-import warnings
-import zipfile
 from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
 import numpy as np
 import pandas as pd
-import pyogrio
 import shapely
 
 from vinemap.errors import InputError
 from vinemap.geo.crs import LOCAL, is_local, project
+from vinemap.geo.layers import parts_of, polygons_of, read_layers
+from vinemap.geo.place import check_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,16 +22,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
     from pyproj import CRS
-    from shapely.geometry.base import BaseGeometry
 
-PARCEL_LAYER = "parcel"
 WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
 """Columns that are likely to name polygons, the likeliest first, and such as number them."""
 OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
 OF_KML |= {"draworder", "icon", "snippet"}
 """Columns of every KML, which name nothing."""
-ZIPPED = (".shp", ".gpkg", ".geojson", ".kml")
-"""Files of polygons in a ``.zip``."""
+WHOLE = 2**53
+"""Number from which on not every whole one has a float."""
 MOST_NAMED = 5
 """Things that are named where many are left out."""
 Boundary = tuple[shapely.Geometry, "CRS"]
@@ -190,26 +187,40 @@ def _parcel(table: _Table, rows: NDArray[np.int_], path: Path) -> Parcel:
     shapes = table.frame.geometry.to_numpy()[rows[table.area[rows]]]
     if len(shapes) == 0:
         raise NoAreaError(f"{_described(table, int(rows[0]))} is no polygon")
-    polygon = _areas(shapely.make_valid(shapely.union_all([_areas(shape) for shape in shapely.make_valid(shapes)])))
-    if not np.isfinite(shapely.bounds(polygon)).all():
+    polygons = [part for shape in shapely.force_2d(shapes) for part in polygons_of(shape)]
+    known = np.isfinite(shapely.get_coordinates(polygons)).all()
+    polygon = _areas(shapely.union_all([_valid(part) for part in polygons])) if known else shapely.Polygon()
+    if shapely.is_empty(polygon):
         raise InputError(f"{path}: its polygon is empty or has coordinates that are no numbers")
-    kinds = [part.geom_type for shape in shapes for part in _parts(shape) if not isinstance(part, shapely.Polygon)]
+    kinds = [part.geom_type for shape in shapes for part in parts_of(shape) if not isinstance(part, shapely.Polygon)]
     beside = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
-    remarks = (f"of the boundary only polygons count, not what stands beside them ({beside})",) if kinds else ()
-    return Parcel((shapely.force_2d(polygon), table.frame.crs), remarks)
+    remarks = {
+        f"of the boundary only polygons count, not what stands beside them ({beside})": bool(kinds),
+        "the boundary's outline crosses itself: is all of the parcel within it?": any(map(_crosses, polygons)),
+    }
+    return Parcel((polygon, table.frame.crs), tuple(remark for remark, holds in remarks.items() if holds))
 
 
-def _parts(geometry: shapely.Geometry | None) -> list[BaseGeometry]:
-    """What a geometry is made of, down to the last collection in a collection."""
-    parts: list[BaseGeometry] = shapely.get_parts(geometry).tolist()
-    return [inner for part in parts for inner in _parts(part)] if hasattr(geometry, "geoms") else parts
+def _valid(polygon: shapely.Polygon) -> shapely.Geometry:
+    """What a polygon's outlines go round, without spikes."""
+    if polygon.is_valid:
+        return polygon
+    return shapely.make_valid(polygon, method="structure", keep_collapsed=False)
+
+
+def _crosses(polygon: shapely.Polygon) -> bool:
+    """Whether an outline crosses itself, so that what is inside isn't clear; spikes do no harm."""
+    if not shapely.is_valid_reason(polygon).startswith("Self-intersection"):
+        return False
+    inside = polygons_of(_valid(polygon))
+    otherwise = polygons_of(shapely.make_valid(polygon))
+    return len(inside) > 1 or not np.isclose(shapely.area(inside).sum(), shapely.area(otherwise).sum(), rtol=1e-6)
 
 
 def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
     """The polygons of a geometry, without points and lines, such as are left of spikes and double edges."""
-    parts = _parts(geometry)
-    areas = [part for part in parts if isinstance(part, shapely.Polygon)]
-    return geometry if len(areas) == len(parts) else shapely.union_all(areas)
+    areas = polygons_of(geometry)
+    return geometry if len(areas) == len(parts_of(geometry)) else shapely.union_all(areas)
 
 
 def _described(table: _Table, row: int) -> str:
@@ -221,22 +232,12 @@ def _described(table: _Table, row: int) -> str:
 
 
 def _read_table(path: Path, *, local: bool = False) -> _Table:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # GDAL's remarks on odd files
-            frame = _read_layers(path)
-    except InputError:
-        raise
-    except Exception as error:  # GDAL's errors come in several classes
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON, KML, KMZ or Shapefile ({reason})") from error
+    frame = read_layers(path)
     if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
         frame = frame.set_crs(LOCAL, allow_override=True)
     if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
         raise InputError(f"{path}: has no geometry or no CRS: save the polygons with their CRS")
-    area = np.array([any(isinstance(part, shapely.Polygon) for part in _parts(shape)) for shape in frame.geometry])
+    area = np.array([bool(polygons_of(shape)) for shape in frame.geometry])
     if not area.any():
         raise InputError(f"{path}: holds no polygon")
     columns = {str(name): _words(frame[name]) for name in frame.columns if name != frame.geometry.name}
@@ -263,43 +264,11 @@ def _rank(column: str, words: pd.Series) -> tuple[int, int]:
 
 def _words(column: pd.Series) -> pd.Series:
     """Names as words, their Unicode composed, None where there is none; whole numbers without decimals."""
-    if pd.api.types.is_float_dtype(column) and (column.dropna() % 1 == 0).all():
-        column = column.astype("Int64")
+    if pd.api.types.is_float_dtype(column):
+        known = column.dropna()
+        column = column.astype("Int64") if ((known % 1 == 0) & (known.abs() < WHOLE)).all() else column
     words = column.dropna().astype(str).str.split().str.join(" ").str.normalize("NFC")
     return words[words != ""].reindex(column.index).astype(object)
-
-
-def _read_layers(path: Path) -> gpd.GeoDataFrame:
-    source = _inside(path)
-    kinds = {str(name): str(kind) for name, kind in pyogrio.list_layers(source)}
-    polygons = [name for name, kind in kinds.items() if "Polygon" in kind] or list(kinds)
-    if path.suffix.lower() in (".kml", ".kmz"):  # whose folders are layers
-        tables = [gpd.read_file(source, layer=name) for name in polygons]
-        return pd.concat([table for table in tables if len(table)] or tables, ignore_index=True)
-    if len(polygons) > 1 and PARCEL_LAYER not in polygons:
-        raise InputError(f"{path}: has several layers of polygons ({', '.join(polygons)}): save the parcels' alone")
-    return gpd.read_file(source, layer=PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0])
-
-
-def _inside(path: Path) -> str:
-    """A file as GDAL finds it, or the one of polygons in a ``.zip``."""
-    if path.suffix.lower() != ".zip":
-        return str(path)
-    inner = polygons_in(path)
-    if len(inner) != 1:
-        known = ", ".join(inner) or "none"
-        raise InputError(f"{path}: holds {len(inner)} files of polygons ({known}), and must hold one: unpack it")
-    return f"/vsizip/{path}/{inner[0]}"
-
-
-def polygons_in(path: Path) -> list[str]:
-    """Names of the files of polygons in a ``.zip``; none of what is no such file."""
-    try:
-        with zipfile.ZipFile(path) as packed:
-            names = packed.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return []
-    return [name for name in names if name.lower().endswith(ZIPPED) and not name.startswith("__MACOSX")]
 
 
 def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
@@ -312,5 +281,8 @@ def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry
     """
     polygon = project(*boundary, target)
     if not np.isfinite(shapely.bounds(polygon)).all():
+        outline, crs = boundary
+        x, y = shapely.get_coordinates(outline)[0].tolist()
+        check_place(crs, x, y, "the boundary", remedy="save it with its CRS")
         raise InputError(f"the boundary can't be brought to {target.name}, the CRS of {path}: check its CRS")
     return polygon

@@ -10,7 +10,7 @@ from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
-from vinemap.geo.boundaries import polygons_in
+from vinemap.geo.layers import polygons_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
