@@ -114,6 +114,7 @@ def test_folder_that_cannot_be_written(tmp_path, survey):
 
 
 def test_wrong_words(tmp_path):
+    assert_refused(vinemap("run", "a.laz", "--out", "", cwd=tmp_path), "'--out': its name is empty")
     assert_refused(vinemap("run", cwd=tmp_path), "Missing argument 'CLOUD...'")
     assert_refused(vinemap("run", "a.laz", "--origin", "north", cwd=tmp_path), "latitude, longitude and altitude")
     assert_refused(vinemap("fly", cwd=tmp_path), "fly")

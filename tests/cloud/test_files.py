@@ -1,5 +1,6 @@
 """Clouds in many files: tiles and flights read as one, each of them once."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import shapely
 from pyproj import CRS, Transformer
+from systems import POSIX
 
 from vinemap import paths
 from vinemap.cloud.files import cloud_files
@@ -100,6 +102,31 @@ def test_folders_and_files(survey, tmp_path):
         cloud_files([])
 
 
+@pytest.mark.parametrize("name", ["0 of 1.las", "again.laz"])
+def test_the_same_points_under_another_name_count_once(survey, name):
+    other = survey.tiles[0].with_name(name)
+    laspy.read(survey.tiles[0]).write(other)
+    assert set(cloud_files(other.parent)) - {other} <= set(survey.tiles)
+    assert read_cloud(cloud_files(other.parent)).size == len(survey.points)
+
+
+@POSIX
+def test_what_is_no_file_is_one_line_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.laz")
+    (tmp_path / "gone.laz").symlink_to("nowhere")
+    for path in (tmp_path / "pipe.laz", tmp_path / "gone.laz", Path("/dev/zero")):
+        with pytest.raises(InputError, match=f"{path}: can't be read: it is no file"):
+            cloud_files(path)
+    with pytest.raises(InputError, match=r"gone\.laz: can't be read: it is no file"):
+        cloud_files(tmp_path)
+
+
+def test_a_local_flight_and_one_on_the_globe_do_not_go_together(survey):
+    write(survey.tiles[1], survey.points, CRS.from_wkt('LOCAL_CS["site",UNIT["metre",1]]'))
+    with pytest.raises(InputError, match=r"1\.laz: site can't be brought to WGS 84 / UTM zone 32N, that of 0\.laz"):
+        read_cloud(survey.tiles)
+
+
 def test_each_cloud_counts_once(survey):
     first = survey.tiles[0]
     twin = first.with_name("0.copc.laz")
@@ -107,7 +134,7 @@ def test_each_cloud_counts_once(survey):
     assert cloud_files(first.parent) == (twin, survey.tiles[1])
     first.with_name("0 (copy).laz").write_bytes(first.read_bytes())
     recipe = recipe_of(first.parent, parcel="A")
-    assert recipe.clouds == (first.with_name("0 (copy).laz"), survey.tiles[1])
+    assert recipe.clouds == (twin, survey.tiles[1])
     assert [source.path for source in recipe.sources] == list(recipe.clouds)
     assert recipe.key != recipe_of(first, parcel="A").key
     write(twin, survey.points)

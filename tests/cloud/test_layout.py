@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 from commands import assert_refused, vinemap
-from lasfiles import FORMATS, points
+from lasfiles import FORMATS, as_las, points
 
 from vinemap.cloud.copc import points_about
 from vinemap.cloud.las import opened, read_cloud
@@ -169,11 +169,37 @@ def test_records_behind_the_points_are_not_trusted(damaged, kind, at, n):
 def test_an_offset_that_no_place_has(damaged, kind):
     refused(damaged(kind, (155, "<d", 1e40)), "is no number that a place has")
     refused(damaged(kind, (155, "<d", 9e8)), "coordinates (9000000")
+    refused(damaged(kind, (131, "<d", 1e-300)), "is no number that a place has")
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_points_outside_of_the_box_that_is_stated(damaged, kind):
     refused(damaged(kind, (179, "<d", 414_725.0)), "points lie outside of the box that its header states")
+
+
+@pytest.mark.parametrize("byte", [b"\0", b"\xff"])
+@pytest.mark.parametrize("kind", ["las 1.2", "las 1.4"])
+@pytest.mark.parametrize("part", [slice(1000, None), slice(500, 700)])
+def test_points_that_a_disk_has_lost(tmp_path, byte, kind, part):
+    """All of its length, and of one bit throughout at the end or within."""
+    las, path = as_las(2000, kind), tmp_path / "a.las"
+    las.return_number[:] = 1
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    begin, length = points_at(data), las.point_format.size
+    first, last, _ = part.indices(2000)
+    data[begin + first * length : begin + last * length] = byte * (last - first) * length
+    path.write_bytes(data)
+    refused(path, f"{last - first:,} of its points hold nothing but zeros")
+
+
+def test_points_at_the_offset_are_points(tmp_path):
+    """As scanners tell of what they don't see."""
+    las = as_las(2000, "las 1.4")
+    las.X[:20], las.Y[:20], las.Z[:20] = 0, 0, 0
+    las.return_number[:] = 1
+    las.write(tmp_path / "a.las")
+    assert read_cloud(tmp_path / "a.las", crs=CRS).size == 2000
 
 
 def test_one_stray_outside_of_the_box_costs_nothing_but_itself(damaged):

@@ -63,9 +63,15 @@ def test_surveys_are_files_and_folders(clouds, place):
     assert surveys["may"].boundaries is None
 
 
-@pytest.mark.parametrize("name", [".may.laz", ".may", "may.txt", "may.tif", "parcels.gpkg"])
-def test_what_is_hidden_or_something_else_is_left_out(clouds, place, name):
-    put(clouds["laz 1.4"], place / name / "a.laz" if name == ".may" else place / name)
+@pytest.mark.parametrize("name", [".may.laz", ".may/a.laz"])
+def test_what_is_hidden_is_left_out(clouds, place, name):
+    put(clouds["laz 1.4"], place / name)
+    assert found(place) == []
+
+
+@pytest.mark.parametrize("name", ["may.txt", "may.tif", "parcels.gpkg"])
+def test_something_else_is_left_out(place, name):
+    (place / name).write_bytes(b"something")
     assert found(place) == []
 
 
@@ -77,6 +83,8 @@ def test_what_is_hidden_or_something_else_is_left_out(clouds, place, name):
         ("may.tar.gz", "unpack it"),
         ("may.e57", "save it as LAS or LAZ"),
         ("may.PLY", "save it as LAS or LAZ"),
+        ("may.zip.001", "unpack it"),
+        ("may.ldr", "save it as LAS or LAZ"),
         ("may.laz.part", "is its upload over?"),
         ("may.las.filepart", "is its upload over?"),
     ],
@@ -98,6 +106,35 @@ def test_what_cannot_be_used_is_named_with_what_to_do(clouds, place, folder, nam
         assert arrival.config.cloud == place / "may" / "a.laz"
         (passed,) = arrival.passed
         assert passed.startswith(name)
+
+
+@pytest.mark.parametrize("name", ["may.laz.bak", "may.laz (1)", "may.copc", "may"])
+def test_a_cloud_of_another_name_is_told(clouds, place, name):
+    put(clouds["laz 1.4"], place / "june" / name)
+    told = f"{place / 'june' / name} is a cloud by its first bytes: let its name end in .las or .laz"
+    assert reasons(place) == {"june": told}
+    put(clouds["laz 1.4"], place / "june" / "a.laz")
+    assert found(place)[0].passed == (told.removeprefix(f"{place / 'june'}{os.sep}"),)
+    if name != "may":
+        put(clouds["laz 1.4"], place / name)
+        assert name in reasons(place)
+
+
+@POSIX
+def test_a_tile_that_is_no_file_is_not_passed_over(clouds, place):
+    """Of a disk that isn't there, say."""
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    (place / "may" / "b.laz").symlink_to("/nowhere/b.laz")
+    assert reasons(place) == {"may": f"{place / 'may' / 'b.laz'}: can't be read: it is no file"}
+
+
+@pytest.mark.parametrize("name", ["p.dxf", "p.gdb"])
+def test_polygons_in_another_form_are_told_where_there_are_none(clouds, place, name):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    (place / "may" / name).mkdir()
+    assert found(place)[0].passed == (f"{name} can't be read: if it holds the parcels, save them as GeoPackage",)
+    polygons(place / "may" / "p.gpkg")
+    assert found(place)[0].passed == ()
 
 
 def test_a_survey_waits_for_the_last_of_its_files(clouds, place):
@@ -122,7 +159,7 @@ def test_clouds_in_deeper_folders_are_told(clouds, place):
     assert found(place)[0].passed == ("old holds clouds, too: move them up",)
 
 
-@pytest.mark.parametrize("name", ["p.kml", "p.kmz", "p.zip", "p.geojson", "p.json", "p.SHP"])
+@pytest.mark.parametrize("name", ["p.kml", "p.kmz", "p.zip", "p.geojson", "p.json", "p.SHP", "p.fgb", "p.gml"])
 def test_polygons_of_any_kind_are_a_surveys(clouds, place, name):
     put(clouds["laz 1.4"], place / "may" / "a.laz")
     path = place / "may" / name
@@ -197,7 +234,8 @@ def test_a_clock_that_is_ahead_holds_nothing_up(clouds, place):
 
 
 def test_several_clouds_are_one(clouds, place):
-    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "b.las")
+    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "a_copy.las")
+    laspy.read(clouds["las 1.4"])[:1000].write(place / "may" / "b.las")
     assert found(place)[0].config.cloud == [place / "may" / "a.laz", place / "may" / "b.las"]
     (place / "may" / "survey.yaml").write_text("cloud: a.laz\n")
     assert found(place)[0].config.cloud == place / "may" / "a.laz"

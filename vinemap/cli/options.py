@@ -7,7 +7,18 @@ from typing import Any
 
 import click
 
-FILE = click.Path(path_type=Path)
+
+class FileParam(click.Path):
+    """A file or a folder, which has a name: an empty one would be the folder where a command runs."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path in a text."""
+        if not str(value):
+            self.fail("its name is empty", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+FILE = FileParam(path_type=Path)
 
 
 class OriginParam(click.ParamType):  # type: ignore[type-arg]

@@ -7,6 +7,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vinemap import paths
 from vinemap.cloud.las_end import begins_as_las, read_head
 from vinemap.errors import InputError
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 CLOUDS = (".las", ".laz")
 COPC = ".copc.laz"
+BOX = 179
+"""Where a header tells of greatest and least coordinates, in turn."""
 
 
 def listed(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
@@ -51,18 +55,22 @@ def cloud_files(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a file is a cloud by its name, and not one that is hidden."""
-    return path.suffix.lower() in CLOUDS and not path.name.startswith(".") and path.is_file()
+    """Whether something is a cloud by its name, and neither a folder nor hidden."""
+    return path.suffix.lower() in CLOUDS and not path.name.startswith(".") and not path.is_dir()
 
 
 def once(files: Sequence[Path]) -> tuple[Path, ...]:
-    """Files without those that stand beside one of the same name in a better format: COPC before LAZ before LAS.
+    """Files without those that hold the points of another: by the same name, or by their number and box.
+
+    Of one name in several formats COPC goes before LAZ before LAS.
 
     Raises
     ------
     InputError
-        If they hold another number of points, as far as their headers are whole.
+        If what has one name holds another number of points, as far as headers are whole, or something is no file.
     """
+    if odd := next((path for path in files if not path.is_file() and (path.exists() or path.is_symlink())), None):
+        raise InputError(f"{odd}: can't be read: it is no file")
     groups: dict[tuple[Path, str], list[Path]] = {}
     for path in dict.fromkeys(files):
         groups.setdefault((path.parent, paths.bare(path)), []).append(path)
@@ -71,7 +79,23 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
         known = [path for path, n in counts.items() if n is not None]
         if other := next((path for path in known if counts[path] != counts[known[0]]), None):
             raise InputError(f"{known[0]} and {other.name} hold another number of points: keep the one that is right")
-    return tuple(max(group, key=_rank) for group in groups.values())
+    best = [max(group, key=_rank) for group in groups.values()]
+    alike: dict[object, list[Path]] = {}
+    for path in best:
+        alike.setdefault((_extent(path) if len(best) > 1 else None) or path, []).append(path)
+    return tuple(max(group, key=_rank) for group in alike.values())
+
+
+def _extent(path: Path) -> tuple[int, bytes] | None:
+    """Number of points and box of which a file's header tells; None if it tells of none."""
+    n = points_in(path)
+    if not n:
+        return None
+    with path.open("rb") as stream:
+        stream.seek(BOX)
+        box = stream.read(48)
+    sides = np.frombuffer(box, "<f8").reshape(3, 2)
+    return (n, box) if (sides[:2, 0] > sides[:2, 1]).all() else None
 
 
 def points_in(path: Path) -> int | None:

@@ -18,9 +18,9 @@ from vinemap.cloud.tiles import Collector
 from vinemap.compute.threads import ahead
 from vinemap.errors import PASSING, BusyError, InputError, OutsideError
 from vinemap.geo.boundaries import Boundary, boundary_in
-from vinemap.geo.crs import horizontal, metric_crs, project, transformer, vertical_name, vertical_unit
+from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name
 from vinemap.geo.place import Place
-from vinemap.geo.stated import check_heights, crs_of, examined
+from vinemap.geo.stated import crs_of, examined, to_place
 from vinemap.geo.zones import deal, zones_of
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ LARGEST_RELIEF = 2_000.0
 """Metres of height in one survey, at the most."""
 LARGEST_SPAN = 50_000.0
 """Metres: what is wider isn't one survey but broken coordinates."""
-FARTHEST = 1e9
-"""Metres, feet or degrees beyond which no place lies."""
+FARTHEST, FINEST = 1e9, 1e-15
+"""Metres, feet or degrees beyond which no place lies, and below which no step is stored."""
 WHOLE = 0.01
 """Steps of the scale by which the box that a header states may miss whole numbers of them."""
 LOOSE = 0.003
@@ -130,7 +130,7 @@ def open_cloud(
         except InputError as error:
             raise InputError(f"{first.path}: {error}") from error
         place = Place(target, vertical_name(first.source), remarks)
-        metric = (_to_metric(chunk, place, files[0]) for chunk in chain([first], chunks))
+        metric = (to_place(*chunk, place, files[0]) for chunk in chain([first], chunks))
         with ahead(metric) as prepared:
             yield place, prepared
 
@@ -206,7 +206,7 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
     if header.point_count == 0:
         raise InputError(f"{path}: holds no points")
     numbers = np.concatenate([header.scales, header.offsets])
-    if not (np.abs(numbers) < FARTHEST).all() or (header.scales == 0).any():
+    if not (np.abs(numbers) < FARTHEST).all() or (np.abs(header.scales) < FINEST).any():
         raise InputError(f"{path}: scale or offset in its header is no number that a place has: write the file again")
     with np.errstate(all="ignore"):
         steps = (np.array([header.mins, header.maxs]) - header.offsets) / header.scales
@@ -228,12 +228,13 @@ def _check_header(header: Any, crs: CRS, path: Path) -> None:
 def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Floats]:
     """Coordinates (n, 3) of a file's usable points, or of those found, in its own CRS, chunk by chunk."""
     total, done = reader.header.point_count if found is None else len(found), 0
-    beyond = 0
+    beyond, blank = 0, 0
     size = max(1, min(CHUNK, MOST_BYTES // reader.header.point_format.size))
     box = _stated_box(reader.header)
     try:
         for chunk in reader.chunk_iterator(size) if found is None else [found]:
             done += len(chunk)
+            blank += _n_blank(chunk)
             columns = [np.asarray(column) for column in (chunk.x, chunk.y, chunk.z)]
             beyond += _n_outside(columns, box)
             xyz = _usable(np.column_stack(columns), chunk)
@@ -245,11 +246,20 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
         raise unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
+    if blank > max(STRAYS, MOST_OUTSIDE * done):
+        raise InputError(f"{path}: {blank:,} of its points hold nothing but zeros: copy or download it again")
     if beyond > max(STRAYS, MOST_OUTSIDE * done):
         raise InputError(
             f"{path}: {beyond:,} points lie outside of the box that its header states, as in damaged files: copy or "
             "download it again, or have its header written anew"
         )
+
+
+def _n_blank(chunk: Any) -> int:
+    """How many points of a chunk have the same bit throughout, as where a disk has lost a part of a file."""
+    at_offset = (chunk.X == chunk.Y) & (chunk.Y == chunk.Z) & ((chunk.X == 0) | (chunk.X == -1))
+    data = np.frombuffer(chunk.array[at_offset].tobytes(), np.uint8).reshape(-1, chunk.array.itemsize)
+    return int(((data == 0) | (data == 255)).all(axis=1).sum())
 
 
 def _stated_box(header: Any) -> Box | None:
@@ -308,18 +318,6 @@ def _usable(xyz: Floats, chunk: Any) -> Floats:
         xyz = xyz[~noise]
     if not np.isfinite(xyz.sum()):
         xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    return xyz
-
-
-def _to_metric(chunk: _Chunk, place: Place, first: Path) -> Floats:
-    """Points (n, 3) of a file, in metres of the place of the first."""
-    xyz, source, path = chunk
-    flat, target = horizontal(source), place.crs
-    if flat != target:
-        xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
-        xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    check_heights(source, place, path, first)
-    xyz[:, 2] *= vertical_unit(source)
     return xyz
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from vinemap.config.surveys import EstateConfig, SurveyConfig
 
-POLYGONS = (".gpkg", ".geojson", ".kml", ".kmz", ".shp", ".json", ".zip")
+POLYGONS = (".gpkg", ".geojson", ".kml", ".kmz", ".shp", ".fgb", ".gml", ".geojsonl", ".tab", ".mif", ".json", ".zip")
 """Files of polygons; what is in the last two kinds must be seen."""
 FEATURES = b"FeatureCollection"
 """What stands in the beginning of GeoJSON."""
@@ -27,12 +28,19 @@ BEGINNING = 4096
 USUAL = ("parcels", "boundaries", "boundary")
 """What the file of the parcels' polygons is called where there are others."""
 UNUSABLE = {
-    "can't be read: unpack it": (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"),
+    "can't be read: unpack it": (
+        *(".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".lz4", ".001", ".z01"),
+    ),
     "can't be read: save it as LAS or LAZ": (
         *(".e57", ".ply", ".pts", ".ptx", ".xyz", ".pcd", ".rcp", ".rcs", ".fls", ".zfs", ".zlas", ".lsproj"),
+        *(".slpk", ".ldr", ".rdb", ".rxp"),
     ),
 }
 """What to do with files that hold clouds in another form."""
+NO_POLYGONS = "can't be read: if it holds the parcels, save them as GeoPackage"
+OTHER_POLYGONS = (".dxf", ".dwg", ".gdb", ".mdb", ".parquet", ".topojson", ".sqlite", ".gpx")
+"""Files that may hold polygons in another form; the third is a folder."""
+MISNAMED = "is a cloud by its first bytes: let its name end in .las or .laz"
 PARTIAL = (".part", ".partial", ".filepart", ".crdownload", ".download", ".opdownload", ".tmp", ".aria2", ".!ut")
 """How files end that are no whole uploads."""
 DEEP = ("*/*", "*/*/*", "*/*/*/*")
@@ -173,14 +181,17 @@ def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConf
 
 def _found(files: Iterable[Path], folder: Path | None) -> _Found:
     """What is what among the files of a survey."""
-    shown = sorted(p for p in files if not p.name.startswith(".") and (p.is_file() or not folder))
+    everything = sorted(p for p in files if not p.name.startswith("."))
+    shown = [p for p in everything if p.is_file() or not folder]
     polygons = [p for p in shown if _has_polygons(p)] if folder else []
     if len(polygons) > 1:
         polygons = [p for p in polygons if p.stem.lower() in USUAL] or polygons
     own = folder / paths.OWN_CONFIGURATION if folder and (folder / paths.OWN_CONFIGURATION).is_file() else None
     unusable = {p: why for p in shown if (why := _unusable(p))}
+    if folder and not polygons:
+        unusable |= {p: NO_POLYGONS for p in everything if p.suffix.lower() in OTHER_POLYGONS}
     partial = [p for p in shown if p.suffix.lower() in PARTIAL]
-    clouds = once([p for p in shown if is_cloud(p)])
+    clouds = once([p for p in everything if is_cloud(p)])
     deeper = _deeper(folder, DEEP[:1] if clouds else DEEP) if folder and not own else []
     return _Found(clouds, polygons, own, unusable, partial, deeper)
 
@@ -221,6 +232,9 @@ def _unusable(path: Path) -> str | None:
     """What to do with a file that can't be read, but may be meant to be."""
     kind = path.suffix.lower()
     what = next((why for why, kinds in UNUSABLE.items() if kind in kinds), None)
+    if what is None and kind not in (*CLOUDS, *PARTIAL) and path.is_file():
+        with suppress(OSError), path.open("rb") as stream:
+            what = MISNAMED if stream.read(4) == b"LASF" else None
     return None if kind == ".zip" and polygons_in(path) else what
 
 
