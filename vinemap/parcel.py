@@ -283,7 +283,7 @@ def follow(
 
         run("Writing", write)
         about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
-        record = record_of(recipe, found.cloud, layers, found.chm, origin=main, **about)
+        record = record_of(recipe, found.cloud, layers, (found.dtm, found.chm), origin=main, **about)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)
         write_item(draft, recipe, record, layers["parcel"])

@@ -36,6 +36,8 @@ MUCH = 0.2
 """Share of the rows' length on which trees don't hang over them."""
 MOST_LEFT = 0.02
 """Share of a parcel on which something may stand that is in no row and might be vines."""
+MOST_TALL = 0.3
+"""Share of a parcel on which trees don't stand."""
 MAIN = 0.1
 """Share of what is in no row from which a reason is worth to be told."""
 
@@ -123,7 +125,9 @@ def _reasons(unmapped: gpd.GeoDataFrame) -> str:
     return "; ".join(told)
 
 
-def height_notices(rows: gpd.GeoDataFrame, chm: Raster, *, highest: float = 3.6) -> list[str]:
+def height_notices(
+    rows: gpd.GeoDataFrame, chm: Raster, unmapped: gpd.GeoDataFrame, *, highest: float = 3.6
+) -> list[str]:
     """Remarks on heights that no vineyard has, as where feet were read as metres.
 
     Parameters are as of :func:`notices`, and the height in metres up to which canopies are looked for.
@@ -138,7 +142,11 @@ def height_notices(rows: gpd.GeoDataFrame, chm: Raster, *, highest: float = 3.6)
     lacking = int(rows["height_m"].isna().sum())
     stations = shapely.get_coordinates(shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP))
     over = np.mean(chm.values.ravel()[cell_of(stations, chm.grid)] > highest)
+    tall = unmapped[unmapped["reason"] == TALL]
+    much = float(tall["share"].sum())
     remarks = {
+        f"what stands on {_size(tall)} is up to {tall['height_m'].max():.1f} m high; if that can't be, {unit}": much
+        > MOST_TALL,
         f"{lacking} of {len(rows)} rows have no canopy that could be measured; if many should, {unit}": lacking > 0,
         f"plants are higher than {highest:g} m on {over:.0%} of the rows, and measured only so far; {unit}": over
         > MUCH,

@@ -33,7 +33,7 @@ def record_of(
     recipe: Recipe,
     points: Cloud,
     layers: dict[str, gpd.GeoDataFrame],
-    chm: Raster,
+    surfaces: tuple[Raster, Raster],
     *,
     origin: Origin | Corner,
     n_key_points: int,
@@ -49,8 +49,8 @@ def record_of(
         The points with their heights above ground.
     layers : dict of GeoDataFrame
         Those of the GeoPackage.
-    chm : Raster
-        Canopy height, NaN where there are no points.
+    surfaces : (Raster, Raster)
+        Terrain, and canopy height, NaN where there are no points.
     origin : Origin or Corner
         Of {Main}.
     n_key_points : int
@@ -58,6 +58,7 @@ def record_of(
     square : bool
         Whether rows could as well run another way.
     """
+    dtm, chm = surfaces
     sections = layers["sections"]
     modelling = sections[["good", "under", "over", "reduction", "quality"]].mean().round(4)
     versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
@@ -79,18 +80,18 @@ def record_of(
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
         "warnings": _places(recipe, points)
-        + _flights(points)
+        + _flights(points, dtm)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])
-        + height_notices(layers["rows"], chm, highest=recipe.settings.cover.high)
+        + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
         + [SQUARE] * square,
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }
 
 
-def _flights(points: Cloud) -> list[str]:
+def _flights(points: Cloud, dtm: Raster) -> list[str]:
     """Whether flights disagree in height, by how much and where."""
-    if (found := disagreement(points)) is None:
+    if (found := disagreement(points, dtm)) is None:
         return []
     metres, share = found
     return [f"two flights disagree by {metres:.2f} m in height on {share:.0%} of the ground: align them, or take one"]
