@@ -225,6 +225,37 @@ def test_a_video_that_does_not_say_how_many_frames_it_has(tmp_path, shots, name,
     assert [frame.time for frame in frames] == pytest.approx(np.arange(len(frames)) / 10, abs=1e-3)
 
 
+def slower(data):
+    """An MP4 whose frames last seven times as long as its list of edits says that the film does."""
+    at = data.index(b"stts") + 16
+    data[at : at + 4] = (7 * int.from_bytes(data[at : at + 4], "big")).to_bytes(4, "big")
+    return data
+
+
+@pytest.mark.parametrize(("change", "last"), [(slower, 7 * (3 * N - 1) / 10), (lambda data: data, (3 * N - 1) / 10)])
+def test_frames_that_a_container_says_are_none_of_the_film(tmp_path, shots, change, last):
+    path = write_video(tmp_path / "a.mp4", shots * 3, codec="mp4v")
+    path.write_bytes(change(bytearray(path.read_bytes())))
+    frames, _ = read(path)
+    assert len(frames) == 3 * N
+    assert frames[-1].time == pytest.approx(last, abs=1e-3)
+
+
+def test_the_times_of_a_stream_that_was_taken_up_again_go_on(tmp_path, shots):
+    path = write_video(tmp_path / "a.ts", shots * 3, codec="mp2v")
+    path.write_bytes(2 * path.read_bytes())
+    frames, _ = read(path)
+    assert [frame.time for frame in frames] == pytest.approx(np.arange(6 * N) / 10, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mp4", "a.ts"])
+def test_frames_alone_under_a_containers_name_have_no_times(tmp_path, shots, name):
+    (tmp_path / name).write_bytes(b"".join(jpegs(shots)))
+    frames, _ = read(tmp_path / name)
+    assert len(frames) == N
+    assert {frame.time for frame in frames} == {None}
+
+
 def test_a_long_hole_in_a_video_does_not_end_it(tmp_path, shots):
     path = write_video(tmp_path / "a.mp4", shots * 20, codec="mp4v")
     data = bytearray(path.read_bytes())
@@ -256,6 +287,14 @@ def test_what_is_no_video(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"nothing" * 1000)
     with pytest.raises(InputError, match="can't be read as a video"):
         read_recording([tmp_path / "a.mp4"], camera=LOW)
+
+
+def test_a_video_of_a_codec_that_is_unknown(tmp_path, shots):
+    """Its container tells how many frames it has."""
+    path = write_video(tmp_path / "a.avi", shots)
+    path.write_bytes(path.read_bytes().replace(b"MJPG", b"QQQQ").replace(b"\xff\xd8\xff", b"QQQ"))
+    with pytest.raises(InputError, match=r"a\.avi: can't be read as a video: .* is its codec unknown"):
+        read_recording([path], camera=LOW)
 
 
 def test_the_lens_is_taken_out(tmp_path):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mjpg", ".mjpeg", ".mpg", ".mpeg", ".ts", ".wmv"}
+VIDEOS |= {".mts", ".m2ts", ".flv", ".3gp", ".ogv", ".h264", ".264", ".h265", ".265", ".hevc"}
 ENDS = {".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9", ".png": b"IEND"}
 """What a whole file has near its end; of one that was cut off, decoders make up the rest."""
 EXIF = {".jpg", ".jpeg", ".tif", ".tiff"}
@@ -38,10 +39,16 @@ MISSES = 50
 """Frames of a video in a row, behind those that it says it has, that can't be read before it counts as ended."""
 LEAST_FRAME = 16
 """Bytes of a frame: a video that says it has more frames than there is room for says nothing."""
-BARE = {".mjpg", ".mjpeg"}
-"""Videos that may be images alone, one behind the other, without times."""
+BARE = {".mjpg", ".mjpeg", ".h264", ".264", ".h265", ".265", ".hevc"}
+"""Videos that may be frames alone, one behind the other, without times."""
+ALONE = (b"\xff\xd8", b"\0\0\1", b"\0\0\0\1", b"--")
+"""What a file of frames alone begins with, whatever its name: an image, a frame, or a line between images."""
+PACKED = b"\0\0\1\xba"
+"""What begins like a frame, and is a container."""
 CONTAINERS = (b"RIFF", b"ftyp", b"\x1aE\xdf\xa3")
 """What other files begin with that have such a name."""
+WHOLE = "ignore_editlist;1"
+"""What decoders are told: to leave no frame out that a container says is none of the film."""
 EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
 """Seconds since 1970 in a file's name, with decimals or as milli-, micro- or nanoseconds."""
 CLOCK = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)[T_ -]?([0-2]\d)[:-]?([0-5]\d)[:-]?([0-5]\d)[._,-]?(\d{1,9})?")
@@ -110,6 +117,7 @@ def time_of(name: str) -> float | None:
 def _quieten() -> None:
     """What is wrong with a frame is said in the track; decoders would add lines of their own."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", WHOLE)
     import cv2
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -149,13 +157,12 @@ def _length(part: list[Path] | Path) -> int | None:
     video = cv2.VideoCapture(str(part))
     try:
         count = video.get(cv2.CAP_PROP_FRAME_COUNT) if video.isOpened() else 0
-        if 0 < count <= part.stat().st_size / LEAST_FRAME:
-            return int(count)
-        if not any(video.read()[0] for _ in range(MISSES)):
+        known = 0 < count <= part.stat().st_size / LEAST_FRAME
+        if not any(video.read()[0] for _ in range(max(MISSES, int(count) if known else 0))):
             raise InputError(f"{part}: can't be read as a video: was it cut off, or is its codec unknown?")
     finally:
         video.release()
-    return None
+    return int(count) if known else None
 
 
 def _one_after_the_other(parts: Sequence[list[Path] | Path], lengths: Sequence[int | None]) -> Iterator[Frame]:
@@ -165,10 +172,13 @@ def _one_after_the_other(parts: Sequence[list[Path] | Path], lengths: Sequence[i
         if isinstance(part, list):
             yield from _read_ahead(part)
             continue
+        told = False
         for frame in _video(part, length or 0):
             time = None if frame.time is None else begun + frame.time
+            if time is not None and told and time <= last:  # as where a stream was taken up again
+                begun, time = begun + last + period - time, last + period if period else None
             if time is not None:
-                last, period = time, max(time - last, 0.0)
+                last, period, told = time, max(time - last, 0.0), True
             yield frame._replace(time=time)
         begun = last + period
 
@@ -219,9 +229,11 @@ def _exif_time(path: Path) -> float | None:
 
 
 def _is_bare(path: Path) -> bool:
-    """Whether a video is images alone, to which decoders make up times."""
+    """Whether a video is frames alone, to which decoders make up times."""
     with path.open("rb") as stream:
         head = stream.read(12)
+    if head.startswith(ALONE) and not head.startswith(PACKED) and not any(mark in head for mark in CONTAINERS):
+        return True
     return path.suffix.lower() in BARE and not any(mark in head for mark in CONTAINERS)
 
 
