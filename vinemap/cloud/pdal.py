@@ -18,7 +18,7 @@ from vinemap.cloud.las import OURS, collected, opened, unreadable
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
 from vinemap.geo.boundaries import boundary_in
-from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
+from vinemap.geo.crs import horizontal, is_local, metric_crs, project, vertical_name, vertical_unit
 from vinemap.geo.place import Place
 from vinemap.geo.stated import check_heights, examined
 
@@ -146,7 +146,7 @@ def reading_pipeline(
         where["bounds"] = _box(project(polygon, target, flat))
     reader = pdal.Reader.copc(**where) if copc else pdal.Reader.las(**where)
     pipeline = reader | pdal.Filter.expression(expression=USABLE)
-    if flat != target:
+    if flat != target and not is_local(flat):
         pipeline = pipeline | pdal.Filter.reprojection(in_srs=flat.to_wkt(), out_srs=target.to_wkt())
     if polygon is not None:
         pipeline = pipeline | pdal.Filter.crop(polygon=shapely.to_wkt(polygon), a_srs=target.to_wkt())

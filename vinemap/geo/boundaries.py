@@ -236,7 +236,7 @@ def _read_table(path: Path, *, local: bool = False) -> _Table:
     if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
         frame = frame.set_crs(LOCAL, allow_override=True)
     if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
-        raise InputError(f"{path}: has no geometry or no CRS: save the polygons with their CRS")
+        raise InputError(f"{path}: has no geometry or no CRS: save it with its CRS, or say --crs local of local ones")
     area = np.array([bool(polygons_of(shape)) for shape in frame.geometry])
     if not area.any():
         raise InputError(f"{path}: holds no polygon")

@@ -235,8 +235,8 @@ def vertical_unit(crs: CRS) -> float:
 def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     """Choose the projected CRS in metres in which a cloud around (x, y) is worked.
 
-    The cloud's own horizontal CRS where it is local, or projected, metric, true to scale there, and such that files
-    keep it as it is; else the UTM zone of the point.
+    ``LOCAL`` where the cloud is local; its own horizontal CRS where that is projected, metric, true to scale there, and
+    such that files keep it as it is; else the UTM zone of the point.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     """
     flat = horizontal(crs)
     if is_local(flat):
-        return flat
+        return LOCAL
     try:
         lon, lat = transformer(flat, WGS84).transform(x, y)
     except ProjError as error:

@@ -216,7 +216,7 @@ def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) ->
         If there is no way from one's CRS to the other's, or their heights don't go together.
     """
     flat, target = horizontal(source), place.crs
-    if flat != target:
+    if flat != target and not (is_local(flat) and is_local(target)):
         try:
             xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
         except ProjError as error:
