@@ -37,7 +37,7 @@ from vinemap.product.geopackage import write_geopackage, write_layer
 from vinemap.product.layers import LAYERS
 at = {"geometry": gpd.points_from_xy([1], [2], [3])}
 frame = gpd.GeoDataFrame({"row_id": [7]}, crs=32632, **at)
-ends = gpd.GeoDataFrame({"row_id": [7], "label": "7", "end": "E1"}, crs=4326, **at)
+ends = gpd.GeoDataFrame({"row_id": [7], "label": "7", "end": "E1", "beyond": "seen"}, crs=4326, **at)
 write_layer(frame, Path(sys.argv[1]), layer="track")
 write_layer(frame, Path(sys.argv[1]), layer="track")
 write_geopackage({"row_ends": ends}, Path(sys.argv[2]), contract={"row_ends": LAYERS["row_ends"]})

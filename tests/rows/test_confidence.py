@@ -149,6 +149,6 @@ def test_rows_that_are_hardly_sure_are_none():
     assert all(line.equals(kept.geometry[row]) for row, line in zip(theirs["row"], theirs.geometry, strict=True))
     none, nothing = believed(rows, gaps, min_confidence=1.0)
     assert len(none) == len(nothing) == 0
-    less = believed(rows.assign(cut=[0.5, 0, 1]), gaps)[0]["confidence"]
+    less = believed(rows.assign(cut=[0.5, 0, 1]), gaps, min_confidence=0.3)[0]["confidence"]
     assert less.tolist() == pytest.approx([0.9 / (0.9 + 0.1 * np.e), 0.8 / (0.8 + 0.2 * np.e**2)])
     assert believed(rows.assign(cut=1.0), gaps, min_confidence=0.7)[0]["confidence"].tolist() == [0.7, 0.7]
