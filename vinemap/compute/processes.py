@@ -84,11 +84,11 @@ def must(command: Sequence[str]) -> Outcome:
 @contextmanager
 def summed_memory() -> Iterator[list[int]]:
     """Give what all processes begun meanwhile hold together (bytes), at the most; 0 where the system doesn't tell."""
-    most, done = [0], threading.Event()
+    most, done, earlier = [0], threading.Event(), set(descendants(os.getpid()))
 
     def watch() -> None:
         while not done.wait(0.1):
-            most[0] = max(most[0], sum(map(resident, descendants(os.getpid()))))
+            most[0] = max(most[0], sum(map(resident, set(descendants(os.getpid())) - earlier)))
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
