@@ -216,7 +216,7 @@ def children(group):
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     """Stopped as by Ctrl-C, to all its processes, or by a scheduler, to the first alone, while parcels are worked."""
-    many(cloud, tmp_path / "many.gpkg", 4)
+    many(cloud, tmp_path / "many.gpkg", 20)
     words = [*VINEMAP, "survey", cloud, "--boundaries", "many.gpkg", "--out", "out"]
     with subprocess.Popen(
         words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -233,7 +233,7 @@ def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
     done = {path.name for path in (tmp_path / "out").iterdir() if path.is_dir()}
     assert not [path.name for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
     assert {line.split(":")[0] for line in (first + rest).splitlines()} <= done
-    assert len(done) < 12
+    assert len(done) < 30
     assert all((tmp_path / "out" / name / "run.json").is_file() for name in done)
 
 
