@@ -176,6 +176,7 @@ def test_all_files_in_a_kmz_count(tmp_path):
     """GDAL reads the first of them alone."""
     rings = [RING.format(f"{k},0,0 {k}.9,0,0 {k}.9,1,0 {k},1,0 {k},0,0") for k in range(2)]
     with zipfile.ZipFile(tmp_path / "b.kmz", "w") as target:
+        target.writestr("files\\nothing.kml", '<kml xmlns="http://www.opengis.net/kml/2.2"><Document/></kml>')
         for name, ring in zip(("doc", "files/more"), rings, strict=True):
             place = f"<Placemark><name>{name}</name>{ring}</Placemark>"
             target.writestr(
@@ -198,7 +199,7 @@ def test_a_layer_that_may_hold_polygons_is_not_passed_over(tmp_path, kind):
         read_boundary(path)
 
 
-@pytest.mark.parametrize("folder", ["", "Parcels 2026/"])
+@pytest.mark.parametrize("folder", ["", "Parcels 2026/", "Parcels\\"])
 def test_a_zipped_shapefile(tmp_path, folder):
     _, squares = polygons(tmp_path / "b.shp", name=["A", "B"])
     with zipfile.ZipFile(tmp_path / "b.zip", "w") as packed:

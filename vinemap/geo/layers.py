@@ -12,6 +12,7 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError
+from vinemap.geo.crs import WGS84
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,7 +74,8 @@ def _read_kml(source: str) -> gpd.GeoDataFrame:
 
 
 def _joined(tables: list[gpd.GeoDataFrame]) -> gpd.GeoDataFrame:
-    return pd.concat([table for table in tables if len(table)] or tables, ignore_index=True)
+    nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84)
+    return pd.concat([table for table in tables if len(table)] or [nothing], ignore_index=True)
 
 
 def _inside(path: Path) -> str:
@@ -93,13 +95,14 @@ def polygons_in(path: Path) -> list[str]:
 
 
 def _names(path: Path, kinds: tuple[str, ...]) -> list[str]:
-    """Names of the files of some kinds in an archive."""
+    """Names of the files of some kinds in an archive, as GDAL has them: some programs write them with backslashes."""
     try:
         with zipfile.ZipFile(path) as packed:
             names = packed.namelist()
     except (OSError, zipfile.BadZipFile):
         return []
-    return [name for name in names if name.lower().endswith(kinds) and not name.startswith("__MACOSX")]
+    found = [name.replace("\\", "/") for name in names if name.lower().endswith(kinds)]
+    return [name for name in found if not name.startswith("__MACOSX")]
 
 
 def parts_of(geometry: shapely.Geometry | None) -> list[BaseGeometry]:
