@@ -121,6 +121,20 @@ def test_two_crss_of_one_file_must_lead_to_one_place(tmp_path, points, code, met
     assert read_cloud(path, crs=CRS(26910)).crs.to_epsg() == 26910
 
 
+def test_another_crs_than_the_files_own_is_told(tmp_path, points):
+    path = write(tmp_path / "a.laz", points + NAPA, crs=26910)
+    for given, told in {"EPSG:26911": True, "EPSG:32610": False, "local": False}.items():
+        remarks = [one for one in read_cloud(path, crs=parse_crs(given)).remarks if "states" in one]
+        assert len(remarks) == told
+        assert not told or remarks[0].startswith("a.laz states NAD83 / UTM zone 10N, which leads 5")
+
+
+def test_a_local_crs_in_wkt_that_keys_know(tmp_path, points):
+    """As programs write it that lost the rest."""
+    wkt = 'LOCAL_CS["NAD83 / UTM zone 10N",UNIT["metre",1]]'
+    assert read_cloud(write(tmp_path / "a.laz", points + NAPA, keys=UTM, wkt=wkt)).crs.to_epsg() == 26910
+
+
 LOCAL_WKT = {
     "metres": 'LOCAL_CS["site",UNIT["metre",1]]',
     "with heights": 'ENGCRS["site",EDATUM["site"],CS[Cartesian,3],AXIS["x",east],AXIS["y",north],AXIS["z",up],'

@@ -156,7 +156,7 @@ def _chunks_of(
             if first is None and found is None:
                 raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
             if first is not None:
-                remarks += examined(first, reader.header, source, path)
+                remarks += examined(first, reader.header, source, path, given=crs is not None)
                 for xyz in chain([first], chunks):
                     yield _Chunk(xyz, source, path)
 

@@ -204,7 +204,7 @@ def _look_into(path: Path, crs: CRS | None) -> tuple[CRS, CRS, bool, list[str]]:
             raise unreadable(path, error) from error
         xyz = np.column_stack([some.x, some.y, some.z])
         target = metric_crs(source, *np.median(xyz[:, :2], axis=0).tolist())
-        return source, target, is_copc(reader.header), examined(xyz, reader.header, source, path)
+        return source, target, is_copc(reader.header), examined(xyz, reader.header, source, path, given=crs is not None)
 
 
 def _run(pipeline: Any, path: Path) -> NDArray[np.void]:

@@ -27,6 +27,8 @@ AMIDST = 0.5
 FOOT = 0.3048
 ROUGH = 3.0
 """Metres of accuracy, as PROJ states it, up to which a transformation isn't worth a word."""
+OTHER_PLACE = 5.0
+"""Metres that two realizations of a datum aren't apart."""
 SAME = 0.01
 """Metres within which two places are the same."""
 GLOBE = 6_371_000.0
@@ -104,6 +106,13 @@ def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
         known = f"{flat.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
         return [] if flat == LOCAL else [known]
     return [*_roughness(flat, x, y), *_other_shift(stated(crs), flat, x, y)]
+
+
+def doubts_of_given(given: CRS, own: CRS, x: float, y: float, of: str) -> list[str]:
+    """Whether a CRS that is given leads elsewhere from a point (x east) than that which a file states: a sentence."""
+    if not OTHER_PLACE < (metres := apart(given, own, x, y)) < np.inf:
+        return []
+    return [f"{of} states {own.name}, which leads {metres:,.0f} m from where --crs does; what is given counts"]
 
 
 def _roughness(flat: CRS, x: float, y: float) -> list[str]:

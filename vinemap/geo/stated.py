@@ -24,7 +24,7 @@ from vinemap.geo.crs import (
     vertical_name,
     vertical_unit,
 )
-from vinemap.geo.place import apart, check_place, doubts_of
+from vinemap.geo.place import OTHER_PLACE, apart, check_place, doubts_of, doubts_of_given
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +38,6 @@ MODEL, PROJECTED, CITATIONS = 1024, 1, (3073, 1026)
 """GeoTIFF's key of the kind of coordinates, its value for projected ones, and keys of what their CRS is called."""
 ESRI = "ESRI PE String = "
 """What stands before WKT in the place of a name."""
-OTHER_PLACE = 5.0
-"""Metres that two realizations of a datum aren't apart."""
 ELLIPSOIDS, DATUMS = range(5001, 5100), range(5101, 5200)
 """Codes that GeoTIFF 1.0 has for heights above an ellipsoid, and above a datum whose CRS has a code 600 higher."""
 HEIGHTS = 'VERTCRS["{}",VDATUM["{}"],CS[vertical,1],AXIS["up",up],LENGTHUNIT["unit",{!r}]]'
@@ -92,10 +90,10 @@ def _horizontal(header: Any, path: Path) -> CRS | None:
     if (codes is None or codes.is_geographic) and MODEL in (keys := _keys(records)):
         own = keys[MODEL].value_offset == PROJECTED
         text, codes = (_named(records, keys) if own and crs == codes else crs for crs in (text, codes))
-    if text is None or codes is None or text == codes:
-        return text or codes
+    if text is None or codes is None or text == codes or is_local(text):
+        return codes or text
     x, y = ((header.mins + header.maxs)[:2] / 2).tolist()
-    if (metres := apart(text, codes, x, y)) > OTHER_PLACE:
+    if OTHER_PLACE < (metres := apart(text, codes, x, y)) < np.inf:
         raise InputError(
             f"{path}: states two CRSs that lie {metres:,.0f} m apart, {text.name} in WKT and {codes.name} in GeoTIFF "
             "keys: say with --crs EPSG:n which is right"
@@ -227,8 +225,8 @@ def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) ->
     return xyz
 
 
-def examined(xyz: Floats, header: Any, source: CRS, path: Path) -> list[str]:
-    """What is to be known of where a file's points are, some of which (n, 3) are given in its own CRS.
+def examined(xyz: Floats, header: Any, source: CRS, path: Path, *, given: bool = False) -> list[str]:
+    """What is to be known of where a file's points are, some of which (n, 3) are in its CRS, which may be given.
 
     Raises
     ------
@@ -239,7 +237,16 @@ def examined(xyz: Floats, header: Any, source: CRS, path: Path) -> list[str]:
     x, y = np.median(sample[:, :2], axis=0).tolist()
     check_place(source, x, y, str(path))
     check_steps(sample, len(xyz), header, source, path)
-    return doubts_of(source, x, y)
+    return [*_overridden(header, source, x, y, path), *doubts_of(source, x, y)] if given else doubts_of(source, x, y)
+
+
+def _overridden(header: Any, given: CRS, x: float, y: float, path: Path) -> list[str]:
+    """Whether a file states a CRS that leads elsewhere than the one that is given for it, and perhaps for others."""
+    try:
+        own = _horizontal(header, path)
+    except Exception:  # noqa: BLE001 - what it states can't be understood, which is why another is given
+        return []
+    return doubts_of_given(given, own, x, y, path.name) if own else []
 
 
 def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> None:
