@@ -204,6 +204,7 @@ def test_coordinates_within_or_beside_their_crs_pass(text, lon, lat):
 def test_a_local_crs_that_a_file_states_is_told():
     (doubt,) = doubts_of(CRS.from_wkt('LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]'), 3.0, 4.0)
     assert doubt.startswith("'Local Coordinates (m)' has no place on the globe")
+    assert metric_crs(CRS.from_wkt('LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]'), 3.0, 4.0) == LOCAL
 
 
 def test_local_coordinates_have_no_place():

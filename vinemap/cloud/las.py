@@ -257,8 +257,8 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
 
 def _n_blank(chunk: Any) -> int:
     """How many points of a chunk have the same bit throughout, as where a disk has lost a part of a file."""
-    at_offset = (chunk.X == chunk.Y) & (chunk.Y == chunk.Z) & ((chunk.X == 0) | (chunk.X == -1))
-    data = np.frombuffer(chunk.array[at_offset].tobytes(), np.uint8).reshape(-1, chunk.array.itemsize)
+    alike = chunk.array[np.flatnonzero(chunk.X == chunk.Y)]
+    data = np.frombuffer(alike.tobytes(), np.uint8).reshape(-1, alike.itemsize)
     return int(((data == 0) | (data == 255)).all(axis=1).sum())
 
 
