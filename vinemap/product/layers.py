@@ -89,7 +89,8 @@ def conform(frame: gpd.GeoDataFrame, layer: str, *, contract: Mapping[str, Layer
     if missing:
         raise ValueError(f"layer {layer} lacks {', '.join(missing)}")
     found = frame[[*columns, "geometry"]]
-    return found.astype({name: kind for name, kind in columns.items() if found.dtypes[name] != kind})
+    kinds = found.dtypes
+    return found.astype({name: kind for name, kind in columns.items() if kinds[name] != kind})
 
 
 def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:

@@ -269,10 +269,12 @@ def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
     """
     frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
     power, spread = np.zeros(len(frequency)), 0.0
-    for _, row in gaps.groupby("row_id"):
-        hidden = row["state"] == UNSEEN
-        for edge, other in (("start_m", "end_m"), ("end_m", "start_m")):
-            at = row.loc[~hidden & ~row[edge].isin(row.loc[hidden, other]), edge].to_numpy()
+    row, hidden = gaps["row_id"].to_numpy(), (gaps["state"] == UNSEEN).to_numpy(dtype=bool)
+    # A number for each place of each row.
+    start, end = (row + 1j * gaps[edge].to_numpy(dtype=float) for edge in ("start_m", "end_m"))
+    for edge, other in ((start, end), (end, start)):
+        told = np.sort_complex(edge[~hidden & ~np.isin(edge, other[hidden])])
+        for at in np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1):
             power += np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
             spread += len(at) * (len(at) - 1)
     # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
