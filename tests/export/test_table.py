@@ -14,7 +14,9 @@ import shapely
 from products import place_product
 
 from vinemap.errors import InputError
+from vinemap.export.table import ROWS
 from vinemap.export.write import export_products
+from vinemap.product.layers import LAYERS
 
 JUNE, SEPTEMBER = "2026-06-18", "2026-09-14"
 
@@ -23,6 +25,12 @@ def lines(kept, *, shift=(0.0, 0.0), length=40.0):
     """Rows 2.5 m apart, of so many places those that are kept."""
     x, y = np.add([400_000.0, 5_000_000.0], shift)
     return [shapely.LineString([(x, y + 2.5 * k, 100), (x + length, y + 2.5 * k, 101)]) for k in kept]
+
+
+def test_a_table_has_the_columns_of_the_layer():
+    in_main = {f"{end}_{axis}" for end in ("e1", "en") for axis in "xyz"}
+    left_out = {*in_main, "e1_alt", "en_alt", "n_key_points"}
+    assert set(LAYERS["rows"].columns) - set(ROWS) == left_out
 
 
 @pytest.fixture(scope="module")

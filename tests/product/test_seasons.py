@@ -6,6 +6,7 @@ import shutil
 import zlib
 from pathlib import Path
 
+import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
@@ -16,6 +17,8 @@ from vinemap.product.pages import changes
 from vinemap.product.pages.page import page, repacked, unpacked
 from vinemap.product.pages.survey import write_index
 from vinemap.product.recipe import product_in
+from vinemap.product.seasons.history import history
+from vinemap.product.seasons.products import read_products, read_rows
 
 FLOWN = {"april": "2026-04-20", "june": "2026-06-18", "fall": "2026-09-14"}
 
@@ -141,3 +144,13 @@ def test_a_parcels_page_shows_its_earlier_flights(flights, tmp_path):
     assert write_index(folder, "september")
     assert unpacked(path.read_text(encoding="utf-8"), "history") is None
     assert product_in(folder / "A")
+
+
+def test_what_was_not_seen_of_a_row_is_told_beside_its_numbers(estate):
+    path = paths.geopackage(estate / "june" / "A", "A")
+    rows = gpd.read_file(path, layer="rows")
+    rows.assign(unseen_m=[0.0, 12.5, np.nan, 0.0]).to_file(path, layer="rows")
+    products = {one.survey: one for folder in estate.iterdir() for one in read_products(folder) if one.parcel == "A"}
+    told = history([(products[survey], read_rows(products[survey].folder, "A")) for survey in ("fall", "june")])
+    length, seen = (np.array(told[name], dtype=float) * told["units"][name] for name in ("length_m", "seen_m"))
+    assert length - seen == pytest.approx(np.array([[0, 0], [0, 0], [0, 0], [12.5, np.nan]]), abs=0.11, nan_ok=True)

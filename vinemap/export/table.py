@@ -77,9 +77,10 @@ ROWS = KEYS | {
     "volume_m3": _real("m3", 3, "Volume of the foliage"),
     "trv_m3_ha": _real("m3/ha", 1, "Tree-row volume: height x width x 10,000 / spacing"),
     "lwa_m2_ha": _real("m2/ha", 1, "Leaf-wall area: both sides of the wall, on a hectare"),
-    "gap_m": _real("m", 3, "Length without canopy"),
+    "gap_m": _real("m", 3, "Length without canopy, as far as it was seen"),
     "n_missing": _whole("Vines missing in its gaps"),
-    "support": _real("1", 4, "Share of its length that has canopy"),
+    "unseen_m": _real("m", 3, "Length of which the cloud shows nothing: neither canopy nor gap"),
+    "support": _real("1", 4, "Share of its length that has canopy, as far as it was seen"),
     "confidence": _real("1", 4, "How sure it is a whole row, 0 to 1"),
     "canopy_confidence": _real("1", 4, "How far to trust height, width and volume, 0 to 1"),
     "flags": _text("What is odd beside its neighbours; nothing where nothing is"),
@@ -155,8 +156,8 @@ def read_tables(products: Sequence[Path]) -> Tables:
                 f"flown on {key[1]}: leave one out"
             )
         seen[key] = folder
-    placed = [one for one in read if one.place]
-    groups = [[placed[k] for k in group] for group in same_places([one.place for one in placed if one.place])]
+    placed = [(one, one.place) for one in read if one.place]
+    groups = [[placed[k][0] for k in group] for group in same_places([place for _, place in placed])]
     groups += [[one] for one in read if not one.place]
     parts: dict[str, list[pd.DataFrame]] = {"rows": [], "vines": []}
     for flights, named in zip(groups, in_threads(_follow, groups), strict=True):
@@ -192,7 +193,7 @@ def _read(folder: Path, record: dict[str, Any]) -> _Product:
         "parcel": parcel,
         "key": str(record.get("key")),
     }
-    return _Product(about, read_product(folder), rows, vines)
+    return _Product(about, None if is_local(rows.crs) else read_product(folder), rows, vines)
 
 
 def _follow(flights: Sequence[_Product]) -> list[list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import shapely
 from vinemap.compute.threads import in_threads
 from vinemap.evaluate.changes import GONE, compare_rows, summarise
 from vinemap.geo.crs import WGS84, project
-from vinemap.product.pages.page import polylines
+from vinemap.product.pages.page import mean_of, polylines
 from vinemap.product.seasons.history import history
 from vinemap.product.seasons.products import read_rows
 
@@ -47,9 +46,7 @@ def tell_parcel(product: Product, earlier: Sequence[Product], crs: CRS) -> dict[
     crs : CRS
         That of the page.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on odd files
-        rows, *before = in_threads(lambda one: read_rows(one.folder, one.parcel), (product, *earlier))
+    rows, *before = in_threads(lambda one: read_rows(one.folder, one.parcel), (product, *earlier))
     zero = np.floor(np.nan_to_num(shapely.bounds(outline_of(product, crs))[:2]))
 
     def drawn(lines: gpd.GeoSeries) -> list[list[list[float]]]:
@@ -83,11 +80,8 @@ def _numbers(rows: gpd.GeoDataFrame | None) -> dict[str, Any]:
     if rows is None:
         return {}
     length = rows["length_m"].to_numpy(dtype=float)
-    height = rows["height_m"].to_numpy(dtype=float)
-    known = np.isfinite(height)
     told: dict[str, Any] = {name: float(rows[name].sum()) for name in ("length_m", "volume_m3", "gap_m", "n_missing")}
-    mean = float(np.average(height[known], weights=length[known])) if known.any() else None
-    return told | {"rows": len(rows), "height_m": mean}
+    return told | {"rows": len(rows), "height_m": mean_of(rows["height_m"], length)}
 
 
 def _compare(rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
@@ -107,7 +101,7 @@ def _compare(rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, be
         columns |= {part: np.round(table[part], digits).tolist() for part in (name, f"d_{name}")}
     share = table["d_volume_m3"] / (table["volume_m3"] - table["d_volume_m3"])
     columns["d_volume"] = np.round(share, 4).tolist()
-    gone = earlier.geometry[earlier["label"].isin(table.loc[table["state"] == GONE, "earlier"])].to_crs(rows.crs)
+    gone = earlier.geometry.iloc[table.loc[table["state"] == GONE, "earlier_place"]].to_crs(rows.crs)
     return told | {
         "shift": changes.shift,
         "summary": summarise(changes),

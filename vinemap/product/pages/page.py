@@ -135,6 +135,13 @@ def as_json(data: Any) -> str:
     return json.dumps(jsonable(data), allow_nan=False, separators=(",", ":"))
 
 
+def mean_of(values: ArrayLike, weights: ArrayLike) -> float:
+    """Weighted mean of the values (n,) that are finite; NaN if none is."""
+    values, weights = np.asarray(values, dtype=float), np.asarray(weights, dtype=float)
+    known = np.isfinite(values)
+    return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan
+
+
 def whole_numbers(values: ArrayLike, *, unit: float) -> list[int | None]:
     """Values (n,) in whole units, 0.01 for centimetres; None for what isn't finite."""
     counts = np.asarray(values, dtype=float) / unit

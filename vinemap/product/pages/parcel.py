@@ -12,7 +12,7 @@ from affine import Affine
 from vinemap import paths
 from vinemap.errors import own_fault
 from vinemap.geo.raster import block_sum
-from vinemap.product.pages.page import as_json, page, polylines, repacked, rings, whole_numbers
+from vinemap.product.pages.page import as_json, mean_of, page, polylines, repacked, rings, whole_numbers
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
-    from numpy.typing import NDArray
 
     from vinemap.geo.raster import Raster
 
@@ -131,7 +130,7 @@ def parcel_page(
 def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]:
     """Key numbers of a parcel; means are weighted by the length of the rows."""
     length = rows["length_m"].to_numpy(dtype=float)
-    means = {name: _mean(rows[name].to_numpy(dtype=float), length) for name in MEANS}
+    means = {name: mean_of(rows[name], length) for name in MEANS}
     return {
         "rows": len(rows),
         "length_m": float(length.sum()),
@@ -142,11 +141,6 @@ def totals(rows: gpd.GeoDataFrame, parcel: gpd.GeoDataFrame) -> dict[str, float]
         **{name: float(rows[name].sum()) for name in ("gap_m", "unseen_m")},
         **means,
     }
-
-
-def _mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    known = np.isfinite(values)
-    return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan
 
 
 def canopy_picture(chm: Raster) -> tuple[bytes, float, float]:

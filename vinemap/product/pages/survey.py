@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -57,23 +58,25 @@ def write_index(folder: Path, survey: str) -> bool:
     about = {name: [product.folder.name, product.warnings, product.files] for name, product in products.items()}
     key = _hash([__version__, survey, known, keys, about])
     target = paths.index(folder)
-    there = _text_of(target)
-    fresh = _key_of(there) == key
-    untold = [name for name, one in products.items() if one.told != (keys[name] if name in earlier else "")]
+    fresh = _key_of(target) == key
+    wanted = {name: keys[name] if name in earlier else "" for name in products}
+    untold = [name for name, one in products.items() if "report" in one.files and one.told != wanted[name]]
     if fresh and not untold:
         return False
-    told = _kept(there, keys)
+    told = _kept(_text_of(target), keys)
     new = [name for name in products if name not in told]
-    read = in_threads(lambda name: tell_parcel(products[name], earlier.get(name, []), crs), new)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on odd files
+        read = in_threads(lambda name: tell_parcel(products[name], earlier.get(name, []), crs), new)
     told |= {name: {"key": keys[name]} | one for name, one in zip(new, read, strict=True)}
     if not fresh:
         write_whole(target, survey_page(survey, known, products, told, key=key))
-    for name in untold:
-        with suppress(
-            OSError, ValueError, KeyError, TypeError
-        ):  # of a product that is no more, or isn't ours to change
-            seasons = told[name].get("history")
-            tell_seasons(products[name].folder, name, seasons, keys[name] if name in earlier else "")
+
+    def tell(name: str) -> None:
+        with suppress(OSError, ValueError, KeyError, TypeError):  # it is no more, or isn't ours to change
+            tell_seasons(products[name].folder, name, told[name].get("history"), wanted[name])
+
+    in_threads(tell, untold)
     return not fresh
 
 
@@ -110,15 +113,17 @@ def _outcomes(folder: Path) -> dict[str, dict[str, Any]]:
         return {}
 
 
-def _text_of(page: Path) -> str:
+def _text_of(page: Path, most: int = -1) -> str:
+    """A page, or so many of its first characters; nothing if it can't be read."""
     try:
-        return page.read_text(encoding="utf-8")
+        with page.open(encoding="utf-8") as stream:
+            return stream.read(most)
     except (OSError, ValueError):
         return ""
 
 
-def _key_of(page: str) -> str | None:
-    return page[:4096].partition('<meta name="made-of" content="')[2].partition('"')[0] or None
+def _key_of(page: Path) -> str | None:
+    return _text_of(page, 4096).partition('<meta name="made-of" content="')[2].partition('"')[0] or None
 
 
 def survey_page(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap.evaluate.changes import follow_rows
+from vinemap.product.notices import SURE
 from vinemap.product.pages.page import whole_numbers
 
 if TYPE_CHECKING:
@@ -17,10 +18,8 @@ if TYPE_CHECKING:
     from vinemap.evaluate.changes import Changes
     from vinemap.product.seasons.products import Product
 
-UNITS = {"length_m": 0.1, "height_m": 0.01, "width_m": 0.01, "volume_m3": 0.01, "gap_m": 0.1, "n_missing": 1.0}
+UNITS = {"length_m": 0.1, "seen_m": 0.1, "height_m": 0.01, "width_m": 0.01, "volume_m3": 0.01, "gap_m": 0.1}
 """In how many of its column's units a number is told."""
-DOUBTFUL = 0.5
-"""Confidence in a canopy's numbers below which they are marked."""
 
 
 def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Changes | None = None) -> dict[str, Any]:
@@ -38,7 +37,8 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
     dict
         ``dates``, the oldest first, each with its ``survey``, ``parcel`` and ``flown``. For each row, those of the
         latest date in their order and then those that are there no more, a list by date, None where it isn't there:
-        ``labels``, what ``units`` has, in these, and ``doubtful``, whether its canopy's numbers are.
+        ``labels``, what ``units`` has, in these (``seen_m`` is the length that was seen), and ``doubtful``, whether its
+        canopy's numbers are.
     """
     tables = [rows for _, rows in flights]
     numbers = follow_rows(tables, latest=latest)
@@ -50,9 +50,11 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
         date = shape[1] - 1 - k
         labels[found, date] = table["label"]
         if "canopy_confidence" in table:
-            doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < DOUBTFUL
+            doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < SURE
+        unseen = table["unseen_m"].fillna(0.0) if "unseen_m" in table else 0.0
+        shown = table.assign(seen_m=table["length_m"] - unseen)
         for name, column in values.items():
-            column[found, date] = table[name]
+            column[found, date] = shown[name]
     return {
         "dates": [
             {"survey": one.survey, "parcel": one.parcel, "flown": one.flown.isoformat()} for one, _ in flights[::-1]

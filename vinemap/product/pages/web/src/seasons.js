@@ -5,8 +5,8 @@ const CANOPY = { doubt: true };
 export const MEASURES = {
   height: { title: "Height", unit: "m", digits: 2, least: 0.1, told: 0.03, ...CANOPY, of: (at) => at("height_m") },
   width: { title: "Width", unit: "m", digits: 2, least: 0.1, told: 0.04, ...CANOPY, of: (at) => at("width_m") },
-  density: { title: "Volume per metre", unit: "m³/m", digits: 2, least: 0.05, told: 0.05, ...CANOPY, of: (at) => ratio(at("volume_m3"), at("length_m")) },
-  gaps: { title: "Gaps, share of the row", unit: "%", digits: 1, least: 2, told: 1, turned: true, of: (at) => ratio(100 * at("gap_m"), at("length_m")) },
+  density: { title: "Volume per metre", unit: "m³/m", digits: 2, least: 0.05, told: 0.05, ...CANOPY, whole: true, of: (at) => ratio(at("volume_m3"), at("seen_m")) },
+  gaps: { title: "Gaps, share of the row", unit: "%", digits: 1, least: 2, told: 1, turned: true, whole: true, of: (at) => ratio(100 * at("gap_m"), at("seen_m")) },
 };
 
 const ratio = (one, other) => (Number.isFinite(one) && other > 0 ? one / other : null);
@@ -26,9 +26,10 @@ export const isDoubtful = (seasons, measure, row, date) => Boolean(measure.doubt
 
 const trusted = (seasons, measure, row, date) => (isDoubtful(seasons, measure, row, date) ? null : valueOf(seasons, measure, row, date));
 
-/** Change of a row from one date to another; null where it isn't known at both. */
+/** Change of a row from one date to another; null where it isn't known at both, as of sums where a part wasn't seen. */
 export function growthOf(seasons, measure, row, from, to) {
-  const [before, after] = [from, to].map((date) => trusted(seasons, measure, row, date));
+  const isWhole = (at) => !measure.whole || at("seen_m") >= at("length_m");
+  const [before, after] = [from, to].map((date) => (isWhole(among(seasons, row, date)) ? trusted(seasons, measure, row, date) : null));
   return before === null || after === null ? null : after - before;
 }
 
