@@ -42,9 +42,13 @@ PAGE_STYLE, PAGE_LICENCES = WEB / "dist" / "style.css", WEB / "dist" / "LICENSES
 
 def safe(name: str) -> str:
     """A name as a file can have it on any system: the name itself, if it can."""
-    cut = FORBIDDEN.sub("-", name).lstrip(".- ")[:LONGEST_NAME].encode()[:MOST_BYTES]
-    plain = cut.decode(errors="ignore").rstrip(". ")
+    plain = _cut(FORBIDDEN.sub("-", name).lstrip(".- "))
     return f"_{plain}" if not plain or DEVICES.fullmatch(plain) else plain
+
+
+def _cut(name: str) -> str:
+    """A name no longer than one may be, and without the end that Windows would leave out."""
+    return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ")
 
 
 def bare(cloud: Path) -> str:
@@ -59,8 +63,7 @@ def stem(cloud: Path) -> str:
 
 def _plain(name: str) -> str:
     """A name without what makes trouble in names of files and on command lines."""
-    kept = re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", name)
-    return kept[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ") or "cloud"
+    return _cut(re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", name)) or "cloud"
 
 
 def named_by(clouds: Sequence[Path]) -> str:
@@ -119,14 +122,13 @@ def product_folder(survey: str, parcel: str) -> Path:
     return parcel_folder(survey_products(survey), parcel)
 
 
-def alike(folder: Path) -> Path:
-    """A folder as its disk tells it from others: some take small letters and capitals for the same.
+def is_caseless(products: Path) -> bool:
+    """Whether the disk of a survey's products takes small letters and capitals for the same.
 
-    A disk that does has the lock of the folder above under another name, too, while that is held.
+    A disk that does has the lock of that folder under another name, too, while it is held.
     """
-    held = lock(folder.parent)
-    same = sys.platform in ("win32", "darwin") or os.path.exists(held.with_name(held.name.upper()))  # noqa: PTH110
-    return folder.with_name(folder.name.casefold()) if same else folder
+    held = lock(products)
+    return sys.platform in ("win32", "darwin") or os.path.exists(held.with_name(held.name.upper()))  # noqa: PTH110
 
 
 def parcel_folder(products: Path, parcel: str) -> Path:

@@ -292,6 +292,18 @@ def test_bad_clouds(pdal, tmp_path, points):
         read_cloud_pdal(tmp_path / "text.laz")
 
 
+@pytest.mark.parametrize("read", [read_cloud, read_cloud_pdal])
+def test_local_files_and_placed_ones_do_not_go_together(pdal, tmp_path, points, read):
+    """By whichever engine; local ones of two names do."""
+    site, plot = (CRS.from_wkt(f'LOCAL_CS["{name}",UNIT["metre",1]]') for name in ("site", "plot"))
+    a, b, c = (write_las(tmp_path / f"{k}.las", points, crs) for k, crs in zip("abc", (site, plot, UTM), strict=True))
+    with pytest.raises(InputError, match=r"a\.las: site can't be brought to WGS 84 / UTM zone 32N, that of c\.las$"):
+        read([c, a])
+    with pytest.raises(InputError, match=r"c\.las: WGS 84 .* can't be brought to local metres, that of a\.las$"):
+        read([a, c])
+    assert shapely.multipoints(read([a, b]).xyz).bounds == pytest.approx(shapely.multipoints(points).bounds, abs=0.001)
+
+
 def test_errors_of_pdal_are_one_line_with_the_files_name(pdal, tmp_path, points, monkeypatch):
     def execute(pipeline):
         raise RuntimeError("readers.las: Invalid point count: 3000.\nNumber of points too large for file size.")

@@ -16,10 +16,10 @@ from vinemap.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from vinemap.cloud.las_end import Head
+
 CLOUDS = (".las", ".laz")
 COPC = ".copc.laz"
-BOX = 179
-"""Where a header tells of greatest and least coordinates, in turn."""
 
 
 def listed(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
@@ -75,8 +75,8 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
     for path in dict.fromkeys(files):
         groups.setdefault((path.parent, paths.bare(path)), []).append(path)
     for group in groups.values():
-        counts = {path: points_in(path) for path in group} if len(group) > 1 else {}
-        known = [path for path, n in counts.items() if n is not None]
+        counts = {path: head.n for path in group if (head := _head(path))} if len(group) > 1 else {}
+        known = list(counts)
         if other := next((path for path in known if counts[path] != counts[known[0]]), None):
             raise InputError(f"{known[0]} and {other.name} hold another number of points: keep the one that is right")
     best = [max(group, key=_rank) for group in groups.values()]
@@ -88,24 +88,20 @@ def once(files: Sequence[Path]) -> tuple[Path, ...]:
 
 def _extent(path: Path) -> tuple[int, bytes] | None:
     """Number of points and box of which a file's header tells; None if it tells of none."""
-    n = points_in(path)
-    if not n:
+    head = _head(path)
+    if not (head and head.n):
         return None
-    with path.open("rb") as stream:
-        stream.seek(BOX)
-        box = stream.read(48)
-    sides = np.frombuffer(box, "<f8").reshape(3, 2)
-    return (n, box) if (sides[:2, 0] > sides[:2, 1]).all() else None
+    sides = np.frombuffer(head.box, "<f8").reshape(3, 2)
+    return (head.n, head.box) if (sides[:2, 0] > sides[:2, 1]).all() else None
 
 
-def points_in(path: Path) -> int | None:
-    """Number of points of which a file's header tells; None if it has no whole header."""
+def _head(path: Path) -> Head | None:
+    """What a file's header says; None if it has no whole header."""
     try:
         with path.open("rb") as stream:
-            head = read_head(stream) if begins_as_las(stream) else None
+            return read_head(stream) if begins_as_las(stream) else None
     except OSError:
         return None
-    return head.n if head else None
 
 
 def date_of(path: Path) -> datetime | None:

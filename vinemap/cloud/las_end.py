@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 HEADER, OLDEST_HEADER = 375, 227
 """Bytes of the header of LAS 1.4, and of the oldest."""
+BOX = slice(179, 227)
+"""Where it tells of greatest and least coordinates, in turn."""
 RECORD, LATE_RECORD = 54, 60
 """Bytes before what a record holds, before the points and behind them."""
 COMPRESSED = 0x80
@@ -37,9 +39,11 @@ class Head(NamedTuple):
     point_length: int
     n: int
     """Points."""
-    late_at: int = 0
-    n_late: int = 0
+    late_at: int
+    n_late: int
     """Records behind the points."""
+    box: bytes
+    """Greatest and least x, y and z, in turn: six doubles."""
 
     @property
     def compressed(self) -> bool:
@@ -106,7 +110,7 @@ def read_head(stream: IO[bytes]) -> Head | None:
     late_at, n_late = 0, 0
     if head[25] >= 4:
         late_at, n_late, n = struct.unpack("<QIQ", head[235:255])
-    return Head(head[25], encoding, length, points_at, n_records, kind, point_length, n, late_at, n_late)
+    return Head(head[25], encoding, length, points_at, n_records, kind, point_length, n, late_at, n_late, head[BOX])
 
 
 def _has_records(stream: IO[bytes], head: Head, size: int) -> bool:

@@ -18,9 +18,9 @@ from vinemap.cloud.las import OURS, collected, opened, unreadable
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
 from vinemap.geo.boundaries import boundary_in
-from vinemap.geo.crs import horizontal, is_local, metric_crs, project, vertical_name, vertical_unit
+from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name, vertical_unit
 from vinemap.geo.place import Place
-from vinemap.geo.stated import check_heights, examined
+from vinemap.geo.stated import check_together, examined
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,7 +102,7 @@ def read_cloud_pdal(
         source, target, copc, more = _look_into(path, crs)
         remarks += more
         place = place or Place(target, vertical_name(source), remarks)
-        check_heights(source, place, path, files[0])
+        check_together(source, place, path, files[0])
         polygon = boundary_in(boundary, place.crs, path) if boundary else None
         reading = reading_pipeline(path, source=source, target=place.crs, polygon=polygon, copc=copc)
         xyz = _coordinates(_run(reading, path))
@@ -146,7 +146,7 @@ def reading_pipeline(
         where["bounds"] = _box(project(polygon, target, flat))
     reader = pdal.Reader.copc(**where) if copc else pdal.Reader.las(**where)
     pipeline = reader | pdal.Filter.expression(expression=USABLE)
-    if flat != target and not is_local(flat):
+    if flat != target:
         pipeline = pipeline | pdal.Filter.reprojection(in_srs=flat.to_wkt(), out_srs=target.to_wkt())
     if polygon is not None:
         pipeline = pipeline | pdal.Filter.crop(polygon=shapely.to_wkt(polygon), a_srs=target.to_wkt())

@@ -19,7 +19,6 @@ from vinemap.errors import ConfigError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-
 WGS84 = CRS.from_epsg(4326)
 LOCAL = CRS.from_wkt(
     'ENGCRS["local metres",EDATUM["unknown"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
@@ -125,13 +124,16 @@ def horizontal(crs: CRS) -> CRS:
     """Return the two-dimensional part of a CRS, which is all that GeoPackage and GeoTIFF keep well.
 
     A shift to WGS 84 that is stated beside it (TOWGS84) counts where the CRS has no code; one that has is kept in files
-    by its code, and means there what PROJ makes of it.
+    by its code, and means there what PROJ makes of it. Local ones in metres, of any name, are ``LOCAL``.
     """
     flat = stated(crs)
+    if is_local(flat) and flat.axis_info[0].unit_conversion_factor == 1.0:
+        return LOCAL
     code = _stated_code(unbound(flat)) or _code_beside(flat) if flat.is_bound else None
     return CRS.from_authority(*code) if code else flat
 
 
+@lru_cache(maxsize=32)
 def stated(crs: CRS) -> CRS:
     """The two-dimensional part of a CRS, with the shift to WGS 84 that is stated beside it, if there is one."""
     return (crs.sub_crs_list[0] if crs.is_compound and crs.sub_crs_list else crs).to_2d()
@@ -192,6 +194,7 @@ def code_of(crs: CRS) -> tuple[str, str] | None:
     return code
 
 
+@lru_cache(maxsize=32)
 def vertical(crs: CRS) -> CRS | None:
     """The vertical part of a compound CRS, or None."""
     return unbound(crs.sub_crs_list[1]) if crs.is_compound and crs.sub_crs_list else None
@@ -247,7 +250,7 @@ def metric_crs(crs: CRS, x: float, y: float) -> CRS:
     """
     flat = horizontal(crs)
     if is_local(flat):
-        return LOCAL
+        return check_horizontal(flat)
     try:
         lon, lat = transformer(flat, WGS84).transform(x, y)
     except ProjError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
@@ -101,11 +102,11 @@ def check_place(crs: CRS, x: float, y: float, of: str, *, remedy: str = GIVE) ->
 
 def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
     """What is to be known of the way from a CRS to WGS 84 near a point (x east): a sentence each."""
-    flat = horizontal(crs)
-    if is_local(flat):
-        known = f"{flat.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
-        return [] if flat == LOCAL else [known]
-    return [*_roughness(flat, x, y), *_other_shift(stated(crs), flat, x, y)]
+    own, flat = stated(crs), horizontal(crs)
+    if is_local(own):
+        known = f"{own.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
+        return [] if own == LOCAL else [known]
+    return [*_roughness(flat, x, y), *_other_shift(own, flat, x, y)]
 
 
 def doubts_of_given(given: CRS, own: CRS, x: float, y: float, of: str) -> list[str]:
@@ -123,10 +124,7 @@ def _roughness(flat: CRS, x: float, y: float) -> list[str]:
         return [f"{UNSURE}: PROJ lacks the grid {lacks} for {_called(flat)}"] if lacks else []
     if not (np.isfinite(lon) and np.isfinite(lat)):
         return []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of grids that are missing
-        near = AreaOfInterest(lon, lat, lon, lat)
-        group = TransformerGroup(flat, WGS84, always_xy=True, area_of_interest=near)
+    group = _ways(flat, round(lon, 1), round(lat, 1))
     metres = _accuracy(flat, x, y)
     known = UNSURE
     if metres >= 0:
@@ -139,6 +137,15 @@ def _roughness(flat: CRS, x: float, y: float) -> list[str]:
     if metres > ROUGH or metres < 0:
         return [f"{known}: PROJ knows no better way there from {_called(flat)}"]
     return []
+
+
+@lru_cache(maxsize=32)
+def _ways(flat: CRS, lon: float, lat: float) -> TransformerGroup:
+    """All ways to WGS 84 near a place in degrees."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of grids that are missing
+        near = AreaOfInterest(lon, lat, lon, lat)
+        return TransformerGroup(flat, WGS84, always_xy=True, area_of_interest=near)
 
 
 def _lacking(flat: CRS) -> str:

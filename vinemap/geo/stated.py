@@ -24,7 +24,7 @@ from vinemap.geo.crs import (
     vertical_name,
     vertical_unit,
 )
-from vinemap.geo.place import OTHER_PLACE, apart, check_place, doubts_of, doubts_of_given
+from vinemap.geo.place import GLOBE, OTHER_PLACE, apart, check_place, doubts_of, doubts_of_given
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +50,7 @@ FEW = 0.25
 """Share of a sample that has values of its own, below which the steps between them are those of their storage."""
 LEAST = 0.1
 """Order of the differences between values that is their step; others are some steps."""
-DEGREE = 111_195.0
+DEGREE = float(np.radians(GLOBE))
 """Metres of a degree of latitude."""
 
 
@@ -190,14 +190,22 @@ def _units() -> dict[int, float]:
     return {int(unit.code): unit.conv_factor for unit in get_units_map("EPSG", category="linear").values()}
 
 
-def check_heights(source: CRS, place: Place, path: Path, first: Path) -> None:
-    """Make sure that a file's heights are above the same datum as those of the first.
+def check_together(source: CRS, place: Place, path: Path, first: Path) -> None:
+    """Make sure that a file's points can be brought to the place of the first.
 
     Raises
     ------
     InputError
-        If they aren't, as far as both files tell.
+        If there is no way from one's CRS to the other's, or their heights aren't above the same datum, as far as both
+        files tell.
     """
+    flat, target = horizontal(source), place.crs
+    try:
+        if flat != target:
+            transformer(flat, target)
+    except ProjError as error:
+        own = stated(source).name
+        raise InputError(f"{path}: {own} can't be brought to {target.name}, that of {first.name}") from error
     if (vertical := vertical_name(source)) != place.vertical:
         raise InputError(
             f"{path}: its heights are above {vertical or 'no datum that it states'}, those of {first.name} above "
@@ -211,16 +219,13 @@ def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) ->
     Raises
     ------
     InputError
-        If there is no way from one's CRS to the other's, or their heights don't go together.
+        If they can't be brought there.
     """
+    check_together(source, place, path, first)
     flat, target = horizontal(source), place.crs
-    if flat != target and not (is_local(flat) and is_local(target)):
-        try:
-            xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
-        except ProjError as error:
-            raise InputError(f"{path}: {flat.name} can't be brought to {target.name}, that of {first.name}") from error
+    if flat != target:
+        xyz[:, 0], xyz[:, 1] = transformer(flat, target).transform(xyz[:, 0], xyz[:, 1])
         xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    check_heights(source, place, path, first)
     xyz[:, 2] *= vertical_unit(source)
     return xyz
 

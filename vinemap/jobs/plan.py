@@ -101,7 +101,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     plan = Plan(sources, date, [], [], listed)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
-    taken: dict[Path, str] = {}
+    taken: dict[str, str] = {}
+    caseless = paths.is_caseless(folder)
     for name, polygon in polygons.items():
         if isinstance(polygon, InputError):
             state = LEFT if isinstance(polygon, NoAreaError) and not listed else FAILED
@@ -113,14 +114,24 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             plan.settled.append(Outcome(name, FAILED, reason=str(error)))
             continue
         place = paths.parcel_folder(folder, parcel)
-        if (other := taken.setdefault(paths.alike(place), parcel)) != parcel:
+        if (other := taken.setdefault(place.name.casefold() if caseless else place.name, parcel)) != parcel:
             reason = f"its folder would be that of {other!r}, {place.name}: give one of the two another name"
             plan.settled.append(Outcome(parcel, FAILED, reason=reason))
             continue
         own = config.of_parcel(parcel)
         boundary, remarks = polygon or (None, ())
-        made_of = parcel, files, sources, boundary, own.settings, crs, own.origin, date, config.survey, remarks
-        recipe = Recipe(*made_of)
+        recipe = Recipe(
+            parcel=parcel,
+            clouds=files,
+            sources=sources,
+            boundary=boundary,
+            settings=own.settings,
+            crs=crs,
+            origin=own.origin,
+            flown=date,
+            survey=config.survey,
+            remarks=remarks,
+        )
         key = recipe.key
         product = None if again else product_in(place)
         if product and (product.key, product.parcel) == (key, parcel):

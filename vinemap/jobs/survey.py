@@ -232,14 +232,14 @@ def _run(
     step: Callable[..., Any],
 ) -> Outcome:
     """Have a parcel worked, and tell what became of it."""
-    began = time.perf_counter()
-    failed = partial(Outcome, recipe.parcel, FAILED, key=recipe.key)
+    began, key = time.perf_counter(), recipe.key
+    failed = partial(Outcome, recipe.parcel, FAILED, key=key)
     target = paths.parcel_folder(folder, recipe.parcel)
     options = {"piece": piece, "drafts": aside, "within": folder, "limit": limit}
     try:
         summary: Summary = step(recipe.parcel, workers.run, follow, recipe, target, **options)
     except OutsideError as error:
-        return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
+        return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=key)
     except VinemapError as error:
         known = isinstance(error, (InputError, ConfigError))
         return failed(seconds=time.perf_counter() - began, reason=str(error), heals=not known)
@@ -249,4 +249,4 @@ def _run(
         if piece:
             piece.path.unlink(missing_ok=True)
     numbers = summary.rows, round(summary.length, 3), round(summary.seconds, 3)
-    return Outcome(recipe.parcel, DONE, *numbers, reason="; ".join(summary.warnings), key=recipe.key)
+    return Outcome(recipe.parcel, DONE, *numbers, reason="; ".join(summary.warnings), key=key)

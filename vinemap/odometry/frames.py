@@ -232,9 +232,9 @@ def _is_bare(path: Path) -> bool:
     """Whether a video is frames alone, to which decoders make up times."""
     with path.open("rb") as stream:
         head = stream.read(12)
-    if head.startswith(ALONE) and not head.startswith(PACKED) and not any(mark in head for mark in CONTAINERS):
-        return True
-    return path.suffix.lower() in BARE and not any(mark in head for mark in CONTAINERS)
+    if any(mark in head for mark in CONTAINERS):
+        return False
+    return path.suffix.lower() in BARE or (head.startswith(ALONE) and not head.startswith(PACKED))
 
 
 def _video(path: Path, length: int) -> Iterator[Frame]:

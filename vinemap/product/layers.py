@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 
 from vinemap.geo.crs import is_local
+from vinemap.geo.layers import polygons_of
 from vinemap.rows.blocks import outline_blocks
 
 if TYPE_CHECKING:
@@ -113,8 +114,8 @@ def parcel_layer(
             _totals(name, rows[rows["block"] == block], polygon, points)
             for name, block, polygon in zip(names, blocks["block"], polygons, strict=True)
         ]
-    parts = [[p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"] for polygon in polygons]
-    return gpd.GeoDataFrame(totals, geometry=[shapely.multipolygons(p) for p in parts], crs=points.crs)
+    shapes = [shapely.multipolygons(polygons_of(polygon)) for polygon in polygons]
+    return gpd.GeoDataFrame(totals, geometry=shapes, crs=points.crs)
 
 
 def _extent(points: Cloud) -> shapely.Geometry:

@@ -87,7 +87,7 @@ def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
     return source
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=65_536)
 def _digest(path: Path, stamp: tuple[int, ...]) -> str:
     """SHA-256 of a file, worked out once a process: a night's plan asks for it, and then its job."""
     del stamp
@@ -130,9 +130,14 @@ class Recipe(NamedTuple):
     remarks: tuple[str, ...] = ()
     """What is to be known of the boundary: a sentence each."""
 
+    @property
+    def flights(self) -> tuple[Source, ...]:
+        """The clouds' sources."""
+        return self.sources[: len(self.clouds)]
+
     def check(self) -> None:
         """Make sure that the clouds are still the same; BusyError if they aren't."""
-        for source in self.sources[: len(self.clouds)]:
+        for source in self.flights:
             source.check()
 
     @property
@@ -145,7 +150,7 @@ class Recipe(NamedTuple):
         parts = {
             "vinemap": __version__,
             "parcel": self.parcel,
-            "cloud": [source.sha256 for source in self.sources[: len(self.clouds)]],
+            "cloud": [source.sha256 for source in self.flights],
             "polygon": polygon,
             "crs": self.crs.to_string() if self.crs else None,
             "origin": self.origin,
@@ -165,10 +170,10 @@ def read_clouds(clouds: Path | Sequence[Path], known: Iterable[Source] = ()) -> 
     BusyError
         If one changes meanwhile.
     """
-    known = list(known)
+    by_path = {source.path: [source] for source in known}
     found: dict[str, Source] = {}
     for path in cloud_files(clouds):
-        source = read_source(path, known)
+        source = read_source(path, by_path.get(path, ()))
         found.setdefault(source.sha256, source)
     return tuple(found.values())
 
