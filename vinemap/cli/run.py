@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -61,5 +62,6 @@ def run(
     with progress(name) as step:
         from vinemap.parcel import map_parcel
 
+        gc.freeze()  # what is imported lives on, so that no collection need look through it: 0.1 s each
         summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
     click.echo(summary.line())

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import label
-from scipy.signal import find_peaks
+from scipy.ndimage import label, maximum_filter1d
 from scipy.spatial import cKDTree
 
 from vinemap.geo.raster import sample_across
@@ -277,7 +276,7 @@ def _kinks(xy: Values, position: Values) -> Values:
     bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
     # Beside a kink it is a bend, and what is straight there no kink.
     kink = np.minimum(np.abs(turn), np.abs(turn - bend))
-    out: Values = along[find_peaks(kink, KINK, distance=2 * k)[0]]
+    out: Values = along[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
     return out
 
 

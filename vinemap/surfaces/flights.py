@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks
 
 from vinemap.geo.raster import above
 
@@ -143,7 +142,9 @@ def _squares(xy: Floats, low: Floats, side: float) -> tuple[NDArray[np.int64], i
 
 def _layers(counts: Floats) -> _Layers | None:
     """The two greatest peaks among the numbers of points by height, if they are thin and apart."""
-    peaks, _ = find_peaks(counts, height=SHARE * counts.max())
+    steps = np.diff(counts)
+    is_peak = (steps[:-1] > 0) & (steps[1:] <= 0) & (counts[1:-1] >= SHARE * counts.max())
+    peaks = np.flatnonzero(is_peak) + 1
     if len(peaks) < 2:
         return None
     greatest = peaks[np.argsort(counts[peaks])[-2:]]
