@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.crs import Origin
     from vinemap.geo.raster import Raster
-    from vinemap.rows.waves import RowField
     from vinemap.surfaces.seen import Seen
+    from vinemap.surfaces.waves import RowField
 
 T = TypeVar("T")
 

@@ -16,11 +16,11 @@ from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, table
 from vinemap.measure.accuracy.rows import compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.parcel import RowMap
-from vinemap.rows.waves import RowField
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate
 from vinemap.simulate.terrain import hillside
+from vinemap.surfaces.waves import RowField
 
 AZIMUTH, SPACING = 40.0, 2.4
 

@@ -6,7 +6,7 @@ from pyproj import CRS
 
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.key_points import central_points, detect_key_points
-from vinemap.rows.waves import RowField
+from vinemap.surfaces.waves import RowField
 
 UTM = CRS.from_epsg(32632)
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vinemap.canopy.mesh import Mesh
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.raster import Raster
-    from vinemap.rows.waves import RowField
+    from vinemap.surfaces.waves import RowField
 
 
 def write_product(

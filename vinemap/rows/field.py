@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
-from vinemap.rows.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, scan_cylinders, scan_spectrum
+from vinemap.surfaces.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, scan_cylinders, scan_spectrum
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -15,7 +15,7 @@ from vinemap.geo.raster import cell_of, sample, sample_across
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Grid, Raster
-    from vinemap.rows.waves import RowField
+    from vinemap.surfaces.waves import RowField
 
 BATCH = 5_000
 WIDE = (1.0, 1.5, 2.0, 3.0)

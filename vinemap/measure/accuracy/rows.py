@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Floats
     from vinemap.parcel import RowMap
-    from vinemap.rows.waves import RowField
     from vinemap.simulate.survey import Survey
+    from vinemap.surfaces.waves import RowField
 
 NEAR = 0.8
 """Metres within which a gap and a dead vine belong together."""
