@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from vinemap import paths
 from vinemap.canopy.classification import classify_points
-from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.mesh import section_meshes
-from vinemap.canopy.model import CanopyModel, model_sections
+from vinemap.canopy.model import CanopyModel, find_canopies, model_sections
 from vinemap.canopy.numbers import judge_canopies, summarise_rows
-from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
@@ -58,7 +56,6 @@ if TYPE_CHECKING:
     import shapely
     from pyproj import CRS
 
-    from vinemap.canopy.foliage import Canopy
     from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
@@ -324,25 +321,15 @@ def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Cal
     Parameters are as of :func:`map_rows`, which finds the rows.
     """
     settings = settings or Settings()
-    canopies = step("Sections", find_canopies, found, settings)
+    cut = found.cloud, found.rows, found.gaps, found.dtm
+    canopies = step("Sections", find_canopies, *cut, settings)
     options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
     model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
     return model
 
 
-def find_canopies(found: RowMap, settings: Settings) -> list[Canopy]:
-    """Cut sections across the rows, and keep those that have a canopy, with its points, row by row."""
-    options: dict[str, Any] = settings.sections.model_dump()
-    options |= {"low": settings.cover.low, "high": settings.cover.high}
-    separate = settings.canopy.model_dump()
-    living = {name: separate.pop(name) for name in ("min_points", "min_share")}
-    canopies = cut_sections(
-        found.cloud, found.rows, found.gaps, found.dtm, partial(separate_canopy, **separate), **options
-    )
-    return living_canopies(canopies, **living)
-
-
 def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
     """Canopy points of sections that leave nothing between them."""
     dense = settings.sections.model_copy(update={"step": min(settings.sections.step, settings.sections.width)})
-    return [canopy.sections for canopy in find_canopies(found, settings.model_copy(update={"sections": dense}))]
+    cut = found.cloud, found.rows, found.gaps, found.dtm
+    return [canopy.sections for canopy in find_canopies(*cut, settings.model_copy(update={"sections": dense}))]

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from vinemap.canopy.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
+from vinemap.canopy.model import find_canopies
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.write import write_classified
 from vinemap.config.settings import Settings
-from vinemap.parcel import find_canopies, map_rows
+from vinemap.parcel import map_rows
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +19,7 @@ def classified(cloud):
     flyers = middle + np.column_stack([np.linspace(-9, 9, 10), np.linspace(9, -9, 10), np.full(10, 12.0)])
     flown = PointCloud(np.concatenate([cloud.xyz, flyers]), cloud.crs)
     found = map_rows(flown, Settings())
-    leaves = [canopy.sections for canopy in find_canopies(found, Settings())]
+    leaves = [canopy.sections for canopy in find_canopies(found.cloud, found.rows, found.gaps, found.dtm, Settings())]
     return flown, found, *classify_points(found.cloud, leaves)
 
 
@@ -52,7 +53,7 @@ def test_canopy_knows_its_row(classified, vineyard):
 def test_a_cloud_without_canopy(cloud):
     flat = PointCloud(cloud.xyz[:1000] * [1, 1, 0], cloud.crs)
     found = map_rows(flat, Settings())
-    leaves = [canopy.sections for canopy in find_canopies(found, Settings())]
+    leaves = [canopy.sections for canopy in find_canopies(found.cloud, found.rows, found.gaps, found.dtm, Settings())]
     classes, row_id = classify_points(found.cloud, leaves)
     assert (classes == GROUND).all()
     assert (row_id == 0).all()

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vinemap.canopy.cgon import enclose
 from vinemap.canopy.feet import find_feet
-from vinemap.canopy.foliage import NO_CANOPY
+from vinemap.canopy.foliage import NO_CANOPY, living_canopies, separate_canopy
 from vinemap.canopy.growth import foliage_reach, grow
 from vinemap.canopy.numbers import Measures, measure_sections, tabulate_sections
 from vinemap.canopy.peeling import peel_sections
 from vinemap.canopy.points import join
+from vinemap.canopy.sections import cut_sections
 from vinemap.compute.threads import in_threads
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
     from vinemap.canopy.foliage import Canopy
     from vinemap.canopy.points import Sections
+    from vinemap.cloud.tiles import Cloud
+    from vinemap.config.settings import Settings
+    from vinemap.geo.raster import Raster
 
 
 class CanopyModel(NamedTuple):
@@ -36,6 +40,26 @@ class CanopyModel(NamedTuple):
     """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
     table: gpd.GeoDataFrame
     """The sections in numbers."""
+
+
+def find_canopies(
+    cloud: Cloud, rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, dtm: Raster, settings: Settings
+) -> list[Canopy]:
+    """Cut sections across the rows, and keep those that have a canopy, with its points, row by row.
+
+    Parameters
+    ----------
+    cloud, rows, gaps, dtm
+        As of :func:`vinemap.canopy.sections.cut_sections`.
+    settings : Settings
+        Of sections, canopy and the heights of the cover.
+    """
+    options: dict[str, Any] = settings.sections.model_dump()
+    options |= {"low": settings.cover.low, "high": settings.cover.high}
+    separate = settings.canopy.model_dump()
+    living = {name: separate.pop(name) for name in ("min_points", "min_share")}
+    canopies = cut_sections(cloud, rows, gaps, dtm, partial(separate_canopy, **separate), **options)
+    return living_canopies(canopies, **living)
 
 
 def model_sections(
