@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import sparse
 from scipy.ndimage import gaussian_filter1d
+from scipy.sparse.linalg import spsolve
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
@@ -56,3 +58,17 @@ def between(curve: Values, start: float, end: float) -> Values:
     """Part of a curve (n, 2) between two metres along it."""
     way = way_along(curve)
     return at(curve, np.concatenate([[start], way[(way > start) & (way < end)], [end]]))
+
+
+def smoothed(curve: Values, *, wavelength: float, beyond: float, step: float) -> Values:
+    """Curve (n, 2) in steps without bends shorter than a wavelength, carried on beyond its ends; all in metres."""
+    n = round(beyond / step)
+    known = np.pad(resample(curve, step), [(n, n), (0, 0)])
+    weight = np.pad(np.ones(len(known) - 2 * n), n)
+    # Third differences: neither the smoothing nor what is carried on straightens an arc.
+    third = sparse.diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(len(known) - 3, len(known)))
+    penalty = (wavelength / step / (2 * np.pi)) ** 6 * (third.T @ third)
+    origin = curve[0]
+    smooth = spsolve(sparse.csc_array(penalty + sparse.diags_array(weight)), weight[:, None] * (known - origin))
+    out: Values = origin + smooth
+    return out

@@ -8,9 +8,17 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, shift
 
 from vinemap.compute.compiled import compiled
+from vinemap.geo.curve import normals
+from vinemap.geo.raster import sample, sample_across
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import geopandas as gpd
+
     from vinemap.compute.arrays import Values
+    from vinemap.geo.raster import Raster
+    from vinemap.surfaces.cover import Levels
 
 TREND = 5.0
 """Cutoff of a row's trend, in cutoffs of its detail."""
@@ -24,6 +32,10 @@ USUAL = 0.8
 """Metres to both sides of a row in which its canopy is looked for, if its spacing leaves as much."""
 SETTLED = 2e-4
 """Metres by which a centre line moves at the most when it is found."""
+ABREAST = 0.48
+"""Share of the spacing, at the most, that lies to both sides of a row and is its own."""
+EDGE, ROOM = 0.2, 1.75
+"""Share of a row's cover at which its canopy ends across it, and how many times that far its points are taken."""
 CELL = 0.05
 """Metres of a cell of a straightened row, along and across."""
 
@@ -175,3 +187,21 @@ def runs_above(profile: Values, level: float) -> Values:
 def half_width(spacing: Values | float) -> Values:
     """Metres to both sides of a row, of a spacing in metres, in which its canopy is looked for."""
     return np.minimum(USUAL, 0.42 * np.asarray(spacing))
+
+
+def half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Raster, levels: Levels) -> Values:
+    """Metres to both sides of courses in which their canopy is looked for: more where it is wide among others."""
+    spacing, alone = (courses[name].to_numpy() for name in ("spacing_m", "alone"))
+    half: Values = half_width(spacing)
+    anywhere = bool(levels.touching.any())
+    for k in np.flatnonzero(~alone).tolist():
+        stations, most = curves[k][:: round(1 / CELL)], max(half[k], ABREAST * spacing[k])
+        if anywhere and (sample(levels.ridge, stations) > sample(levels.body, stations)).any():
+            half[k] = most
+            continue
+        aside = np.arange(0.0, spacing[k] / 2, cover.grid.resolution)
+        offsets = np.concatenate([-aside[:0:-1], aside])
+        profile: Values = sample_across(cover, stations, normals(stations, smoothing=1.0), offsets).mean(axis=0)
+        both = profile[len(aside) - 1 :] + profile[len(aside) - 1 :: -1]
+        half[k] = np.clip(ROOM * aside[both >= EDGE * both.max()][-1], half[k], most)
+    return half

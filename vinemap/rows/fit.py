@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
-from scipy import sparse
 from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.sparse.linalg import spsolve
 
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import extend, normals, resample, way_along
-from vinemap.geo.raster import Raster, cells_in, nearest_cell, sample, sample_across
-from vinemap.rows.centre_line import CELL, USUAL, centre_line, half_width
+from vinemap.geo.curve import extend, normals, resample, smoothed, way_along
+from vinemap.geo.raster import Raster, cells_in, nearest_cell
+from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths
 from vinemap.rows.ends import Standing, cut_to_canopy, lay_out
 
 if TYPE_CHECKING:
@@ -50,10 +48,6 @@ RAMP = 0.1
 """Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
 REACH = 0.2
 """Metres beyond its half width from which a row's points are taken, as it may still move."""
-ABREAST = 0.48
-"""Share of the spacing, at the most, that lies to both sides of a row and is its own."""
-EDGE, ROOM = 0.2, 1.75
-"""Share of a row's cover at which its canopy ends across it, and how many times that far its points are taken."""
 APART = 0.3
 """Share of a row's cover beside it up to which it stands apart from its neighbours."""
 LEAST_CONTRAST = 0.6
@@ -117,7 +111,7 @@ def fit_rows(
     """
     curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
     curtains = courses["curtains_m"].to_numpy()
-    half = np.maximum(_half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
+    half = np.maximum(half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
     fits: dict[int, Standing | None] = {}
     members, vines = np.arange(len(curves)), _where_vines_are(cover, levels, half)
     for _ in range(1 + FARTHER):
@@ -184,24 +178,6 @@ def _reach(image: Values, offsets: Values, half: float) -> float:
     return float(np.clip(inside, least, max(half - CELL, least)))
 
 
-def _half_widths(courses: gpd.GeoDataFrame, curves: Sequence[Values], cover: Raster, levels: Levels) -> Values:
-    """Metres to both sides of courses in which their canopy is looked for: more where it is wide among others."""
-    spacing, alone = (courses[name].to_numpy() for name in ("spacing_m", "alone"))
-    half: Values = half_width(spacing)
-    anywhere = bool(levels.touching.any())
-    for k in np.flatnonzero(~alone).tolist():
-        stations, most = curves[k][:: round(1 / CELL)], max(half[k], ABREAST * spacing[k])
-        if anywhere and (sample(levels.ridge, stations) > sample(levels.body, stations)).any():
-            half[k] = most
-            continue
-        aside = np.arange(0.0, spacing[k] / 2, cover.grid.resolution)
-        offsets = np.concatenate([-aside[:0:-1], aside])
-        profile: Values = sample_across(cover, stations, normals(stations, smoothing=1.0), offsets).mean(axis=0)
-        both = profile[len(aside) - 1 :] + profile[len(aside) - 1 :: -1]
-        half[k] = np.clip(ROOM * aside[both >= EDGE * both.max()][-1], half[k], most)
-    return half
-
-
 def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags, Grid]:
     """Cells with cover and, where that is of ridges alone, those beside, as canopies are wider below."""
     vines: Flags = cover.values > 0
@@ -214,16 +190,7 @@ def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags
 
 def _smooth_course(course: Values) -> Values:
     """Course without the bends that the centre line is to find, carried on beyond its ends."""
-    step = 5 * CELL
-    beyond = round(MARGIN / step)
-    known = np.pad(resample(course, step), [(beyond, beyond), (0, 0)])
-    weight = np.pad(np.ones(len(known) - 2 * beyond), beyond)
-    # Third differences: neither the smoothing nor what is carried on straightens an arc.
-    third = sparse.diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(len(known) - 3, len(known)))
-    penalty = (COURSE / step / (2 * np.pi)) ** 6 * (third.T @ third)
-    origin = course[0]
-    smooth = spsolve(sparse.csc_array(penalty + sparse.diags_array(weight)), weight[:, None] * (known - origin))
-    return resample(origin + smooth, CELL)
+    return resample(smoothed(course, wavelength=COURSE, beyond=MARGIN, step=5 * CELL), CELL)
 
 
 def _deal(
