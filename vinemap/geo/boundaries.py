@@ -4,34 +4,36 @@ from __future__ import annotations
 
 import difflib
 import unicodedata
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import LOCAL, is_local, project
-from vinemap.geo.layers import parts_of, polygons_of, read_layers
+from vinemap.geo.crs import project
+from vinemap.geo.layers import KML, kind_of, parts_of, polygons_of, read_layers, some_of, words_of
 from vinemap.geo.place import check_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    import geopandas as gpd
     from numpy.typing import NDArray
     from pyproj import CRS
 
+    from vinemap.geo.layers import Layer
+
+PARCEL_LAYER = "parcel"
+AREAS, OTHERS = ("Polygon", "Surface"), ("Point", "LineString", "Curve", "None")
+"""What kinds of layers are called that hold polygons, and that hold none; in the rest there may be some."""
 WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
 """Columns that are likely to name polygons, the likeliest first, and such as number them."""
 OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
 OF_KML |= {"draworder", "icon", "snippet"}
 """Columns of every KML, which name nothing."""
-WHOLE = 2**53
-"""Number from which on not every whole one has a float."""
-MOST_NAMED = 5
-"""Things that are named where many are left out."""
 Boundary = tuple[shapely.Geometry, "CRS"]
 """A polygon and its CRS."""
 
@@ -96,8 +98,7 @@ def read_parcel(path: Path, *, parcel: str | None = None, lone: bool = False, lo
     made = _parcel(table, np.arange(len(table.frame)), path)
     others = [_described(table, row) for row in np.flatnonzero(~table.area).tolist()]
     if others:
-        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
-        left = f"{path.name} holds what is no polygon, and is left out: {', '.join(others[:MOST_NAMED])}{more}"
+        left = f"{path.name} holds what is no polygon, and is left out: {some_of(others)}"
         return made._replace(remarks=(*made.remarks, left))
     return made
 
@@ -225,22 +226,17 @@ def _areas(geometry: shapely.Geometry) -> shapely.Geometry:
 
 def _described(table: _Table, row: int) -> str:
     """What a row is, in words."""
-    shape = table.frame.geometry[row]
-    kind = "an empty geometry" if shape is None or shape.is_empty else f"a {shape.geom_type}"
+    kind = kind_of(table.frame.geometry[row])
     words = (words[row] for name, words in table.columns.items() if name.lower() in WORDS)
     return next((f"{kind} {word!r}" for word in words if isinstance(word, str)), kind)
 
 
 def _read_table(path: Path, *, local: bool = False) -> _Table:
-    frame = read_layers(path)
-    if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
-        frame = frame.set_crs(LOCAL, allow_override=True)
-    if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
-        raise InputError(f"{path}: has no geometry or no CRS: save it with its CRS, or say --crs local of local ones")
+    frame = read_layers(path, partial(_polygon_layers, path), "polygons", local=local)
     area = np.array([bool(polygons_of(shape)) for shape in frame.geometry])
     if not area.any():
         raise InputError(f"{path}: holds no polygon")
-    columns = {str(name): _words(frame[name]) for name in frame.columns if name != frame.geometry.name}
+    columns = {str(name): words_of(frame[name]) for name in frame.columns if name != frame.geometry.name}
     ranks = {name: _rank(name, words[area]) for name, words in columns.items() if name.lower() not in OF_KML}
     usable = min(ranks.values(), default=USELESS) < USELESS
     return _Table(frame, area, {name: columns[name] for name in sorted(ranks, key=ranks.__getitem__)}, usable)
@@ -262,13 +258,20 @@ def _rank(column: str, words: pd.Series) -> tuple[int, int]:
     return USELESS[0], likely
 
 
-def _words(column: pd.Series) -> pd.Series:
-    """Names as words, their Unicode composed, None where there is none; whole numbers without decimals."""
-    if pd.api.types.is_float_dtype(column):
-        known = column.dropna()
-        column = column.astype("Int64") if ((known % 1 == 0) & (known.abs() < WHOLE)).all() else column
-    words = column.dropna().astype(str).str.split().str.join(" ").str.normalize("NFC")
-    return words[words != ""].reindex(column.index).astype(object)
+def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
+    """The only layer of polygons of a file, or its layer ``parcel``; of KML all."""
+    if path.suffix.lower() in KML:
+        return layers
+    sure = [layer for layer in layers if any(word in layer.kind for word in AREAS)]
+    open_ = [layer for layer in layers if layer not in sure and not any(word in layer.kind for word in OTHERS)]
+    if len(sure) + len(open_) > 1:
+        open_ = [layer for layer in open_ if any(map(polygons_of, layer.read().geometry))]
+    found = sure + open_ or layers
+    named = [layer for layer in found if layer.name == PARCEL_LAYER]
+    if len(found) > 1 and not named:
+        names = ", ".join(layer.name for layer in found)
+        raise InputError(f"{path}: has several layers of polygons ({names}): save the parcels' alone")
+    return named or found[:1]
 
 
 def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:

@@ -1,10 +1,10 @@
-"""Layers of polygons in people's files, and in archives of such."""
+"""Layers of people's files, and of archives of such: opened whatever their format, their names as words."""
 
 from __future__ import annotations
 
 import warnings
 import zipfile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
 import pandas as pd
@@ -12,85 +12,101 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import WGS84
+from vinemap.geo.crs import LOCAL, WGS84, is_local
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from shapely.geometry.base import BaseGeometry
 
-PARCEL_LAYER = "parcel"
+KML = (".kml", ".kmz")
+"""Files whose folders are layers."""
 ZIPPED = (".shp", ".gpkg", ".geojson", ".kml")
-"""Files of polygons in a ``.zip``."""
-AREAS, OTHERS = ("Polygon", "Surface"), ("Point", "LineString", "Curve", "None")
-"""What kinds of layers are called that hold polygons, and that hold none; in the rest there may be some."""
+"""Files of layers in a ``.zip``."""
+WHOLE = 2**53
+"""Number from which on not every whole one has a float."""
+MOST_NAMED = 5
+"""Things that are named where many are left out."""
 
 
-def read_layers(path: Path) -> gpd.GeoDataFrame:
-    """Read what a file holds in its only layer of polygons, or in its layer ``parcel``; of KML in all layers.
+class Layer(NamedTuple):
+    """A layer of a file, as GDAL finds it."""
+
+    source: str
+    name: str
+    kind: str
+    """What its geometries are called."""
+
+    def read(self) -> gpd.GeoDataFrame:
+        """What it holds."""
+        return gpd.read_file(self.source, layer=self.name)
+
+
+def read_layers(
+    path: Path, choose: Callable[[Sequence[Layer]], Sequence[Layer]], things: str, *, local: bool = False
+) -> gpd.GeoDataFrame:
+    """Read what some layers of a file hold, as one table.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or a ``.zip`` with one.
+    choose : callable
+        Tells which of its layers are read.
+    things : str
+        What is looked for, in words.
+    local : bool
+        Whether coordinates are local, and need no CRS.
 
     Raises
     ------
     InputError
-        If it can't be read, or it isn't clear which layer is meant.
+        If it can't be read, or has no CRS.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder: name the file of polygons in it")
+        raise InputError(f"{path}: is a folder: name the file of {things} in it")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GDAL's remarks on odd files
-            return _read(path)
+            tables = [layer.read() for layer in choose(_layers(path, things))]
     except InputError:
         raise
     except Exception as error:  # GDAL's errors come in several classes
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON, KML, KMZ or Shapefile ({reason})") from error
+    nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84 if path.suffix.lower() in KML else None)
+    frame = pd.concat([table for table in tables if len(table)] or tables or [nothing], ignore_index=True)
+    if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
+        frame = frame.set_crs(LOCAL, allow_override=True)
+    if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
+        raise InputError(f"{path}: has no geometry or no CRS: save it with its CRS, or say --crs local of local ones")
+    return frame
 
 
-def _read(path: Path) -> gpd.GeoDataFrame:
+def _layers(path: Path, things: str) -> list[Layer]:
     if path.suffix.lower() == ".kmz":  # of which GDAL reads one file alone
-        inner = _names(path, (".kml",))
-        tables = [_read_kml(f"/vsizip/{path}/{name}") for name in inner]
-        return _joined(tables or [_read_kml(str(path))])
-    if path.suffix.lower() == ".kml":
-        return _read_kml(str(path))
-    source = _inside(path)
-    kinds = {str(name): str(kind) for name, kind in pyogrio.list_layers(source)}
-    sure = [name for name, kind in kinds.items() if any(word in kind for word in AREAS)]
-    open_ = [name for name, kind in kinds.items() if name not in sure and not any(word in kind for word in OTHERS)]
-    if len(sure) + len(open_) > 1:
-        open_ = [name for name in open_ if any(map(polygons_of, gpd.read_file(source, layer=name).geometry))]
-    polygons = sure + open_ or list(kinds)
-    if len(polygons) > 1 and PARCEL_LAYER not in polygons:
-        raise InputError(f"{path}: has several layers of polygons ({', '.join(polygons)}): save the parcels' alone")
-    return gpd.read_file(source, layer=PARCEL_LAYER if PARCEL_LAYER in polygons else polygons[0])
+        sources = [f"/vsizip/{path}/{name}" for name in _names(path, (".kml",))] or [str(path)]
+    else:
+        sources = [_inside(path, things)]
+    return [Layer(source, str(name), str(kind)) for source in sources for name, kind in pyogrio.list_layers(source)]
 
 
-def _read_kml(source: str) -> gpd.GeoDataFrame:
-    """All layers of a KML, which are its folders."""
-    return _joined([gpd.read_file(source, layer=str(name)) for name, _ in pyogrio.list_layers(source)])
-
-
-def _joined(tables: list[gpd.GeoDataFrame]) -> gpd.GeoDataFrame:
-    nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84)
-    return pd.concat([table for table in tables if len(table)] or [nothing], ignore_index=True)
-
-
-def _inside(path: Path) -> str:
-    """A file as GDAL finds it, or the one of polygons in a ``.zip``."""
+def _inside(path: Path, things: str) -> str:
+    """A file as GDAL finds it, or the one of layers in a ``.zip``."""
     if path.suffix.lower() != ".zip":
         return str(path)
-    inner = polygons_in(path)
+    inner = layers_in(path)
     if len(inner) != 1:
         known = ", ".join(inner) or "none"
-        raise InputError(f"{path}: holds {len(inner)} files of polygons ({known}), and must hold one: unpack it")
+        raise InputError(f"{path}: holds {len(inner)} files of {things} ({known}), and must hold one: unpack it")
     return f"/vsizip/{path}/{inner[0]}"
 
 
-def polygons_in(path: Path) -> list[str]:
-    """Names of the files of polygons in a ``.zip``; none of what is no such file."""
+def layers_in(path: Path) -> list[str]:
+    """Names of the files of layers in a ``.zip``; none of what is no such file."""
     return _names(path, ZIPPED)
 
 
@@ -114,3 +130,23 @@ def parts_of(geometry: shapely.Geometry | None) -> list[BaseGeometry]:
 def polygons_of(geometry: shapely.Geometry | None) -> list[shapely.Polygon]:
     """The polygons that a geometry is made of."""
     return [part for part in parts_of(geometry) if isinstance(part, shapely.Polygon)]
+
+
+def words_of(column: pd.Series) -> pd.Series:
+    """Names as words, their Unicode composed, None where there is none; whole numbers without decimals."""
+    if pd.api.types.is_float_dtype(column):
+        known = column.dropna()
+        column = column.astype("Int64") if ((known % 1 == 0) & (known.abs() < WHOLE)).all() else column
+    words = column.dropna().astype(str).str.split().str.join(" ").str.normalize("NFC")
+    return words[words != ""].reindex(column.index).astype(object)
+
+
+def kind_of(geometry: BaseGeometry | None) -> str:
+    """What a geometry is, in words."""
+    return "an empty geometry" if geometry is None or geometry.is_empty else f"a {geometry.geom_type}"
+
+
+def some_of(things: Sequence[str]) -> str:
+    """Things in words, the first of them where they are many."""
+    more = f" and {len(things) - MOST_NAMED} more" if len(things) > MOST_NAMED else ""
+    return f"{', '.join(things[:MOST_NAMED])}{more}"

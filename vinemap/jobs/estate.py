@@ -11,7 +11,7 @@ from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
-from vinemap.geo.layers import polygons_in
+from vinemap.geo.layers import layers_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -221,7 +221,7 @@ def _has_polygons(path: Path) -> bool:
     """Whether a file is one of polygons, by its name, or by what is in it where many things have such a name."""
     kind = path.suffix.lower()
     if kind == ".zip":
-        return bool(polygons_in(path))
+        return bool(layers_in(path))
     if kind == ".json":
         with path.open("rb") as stream:
             return FEATURES in stream.read(BEGINNING)
@@ -235,7 +235,7 @@ def _unusable(path: Path) -> str | None:
     if what is None and kind not in (*CLOUDS, *PARTIAL) and path.is_file():
         with suppress(OSError), path.open("rb") as stream:
             what = MISNAMED if stream.read(4) == b"LASF" else None
-    return None if kind == ".zip" and polygons_in(path) else what
+    return None if kind == ".zip" and layers_in(path) else what
 
 
 def _check(file: Path) -> None:
