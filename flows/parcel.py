@@ -19,13 +19,15 @@ from vinemap.cloud.pdal import check_engine
 from vinemap.config.surveys import SurveyConfig, choose_parcel, load_survey
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.crs import parse_crs
-from vinemap.parcel import Summary, follow
+from vinemap.parcel import follow
 from vinemap.product.recipe import recipe_of
 from vinemap.simulate.scenes import barolo
 from vinemap.simulate.survey import write_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from vinemap.product.record import Summary
 
 
 def as_tasks(show: Callable[..., Any]) -> Callable[..., Any]:

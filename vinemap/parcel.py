@@ -30,7 +30,7 @@ from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.pages.parcel import write_page
 from vinemap.product.recipe import Recipe, recipe_of
-from vinemap.product.record import record_of
+from vinemap.product.record import Summary, record_of
 from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
 from vinemap.rows.blocks import flag_rows, group_blocks
@@ -71,27 +71,6 @@ BYTES_A_POINT = 60
 
 STAGES: tuple[str, ...] = ("Reading", "DTM", "Canopy cover", "Row field", "Key points", "Clusters", "Curves")
 STAGES += ("Ends and gaps", "Sections", "Canopy", "Mesh", "Unmapped", "Writing")
-
-
-class Summary(NamedTuple):
-    """What a run found, and where it left it."""
-
-    parcel: str
-    folder: Path
-    rows: int
-    length: float
-    seconds: float
-    warnings: tuple[str, ...] = ()
-
-    def line(self) -> str:
-        """The same as a sentence."""
-        remarks = "".join(f"; {warning}" for warning in self.warnings)
-        return f"{self.parcel}: {in_words(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
-
-
-def in_words(rows: int, length: float) -> str:
-    """In words, so many rows of so many metres in all."""
-    return f"{rows} rows, {length:,.0f} m" if rows else "no vine row found"
 
 
 def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:

@@ -13,8 +13,8 @@ from vinemap.config.names import check_parcel
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
-from vinemap.parcel import in_words
 from vinemap.product.recipe import Recipe, Source, flown, product_in, read_clouds, read_source
+from vinemap.product.record import in_words
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from vinemap.cloud.pieces import Piece
     from vinemap.config.surveys import JobOptions, SurveyConfig
     from vinemap.geo.boundaries import Boundary
-    from vinemap.parcel import Summary
     from vinemap.product.recipe import Recipe
+    from vinemap.product.record import Summary
 
 
 class Engine(Protocol):

@@ -1,10 +1,10 @@
-"""The record of a run: what a product was made of, and what is in it."""
+"""The record of a run: what a product was made of, and what is in it; in a line, what was found."""
 
 from __future__ import annotations
 
 import platform
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import shapely
 
@@ -15,6 +15,8 @@ from vinemap.product.notices import height_notices, notices, sight_notices
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import geopandas as gpd
 
     from vinemap.cloud.tiles import Cloud
@@ -27,6 +29,27 @@ SQUARE = (
     "row_field.row_direction prescribes another direction"
 )
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
+
+
+class Summary(NamedTuple):
+    """What a run found, and where it left it."""
+
+    parcel: str
+    folder: Path
+    rows: int
+    length: float
+    seconds: float
+    warnings: tuple[str, ...] = ()
+
+    def line(self) -> str:
+        """The same as a sentence."""
+        remarks = "".join(f"; {warning}" for warning in self.warnings)
+        return f"{self.parcel}: {in_words(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
+
+
+def in_words(rows: int, length: float) -> str:
+    """In words, so many rows of so many metres in all."""
+    return f"{rows} rows, {length:,.0f} m" if rows else "no vine row found"
 
 
 def record_of(
