@@ -13,6 +13,7 @@ REMARKS = {
     "cloud/las_end.py",
     "errors.py",
     "geo/boundaries.py",
+    "geo/lines.py",
     "geo/place.py",
     "jobs/estate.py",
     "jobs/plan.py",

@@ -231,7 +231,7 @@ def test_read_lines_finds_the_layer(tmp_path):
     frame(Point(X, Y)).to_file(path, layer="ends")
     assert read_lines(path).geometry.iloc[0].equals(REFERENCE.geometry.iloc[0])
     frame(line((0, 9), (9, 9))).to_file(path, layer="gaps")
-    with pytest.raises(InputError, match=r"map.gpkg: more than one layer of lines among drawn, ends, gaps"):
+    with pytest.raises(InputError, match=r"map.gpkg: several layers of lines among drawn, ends, gaps"):
         read_lines(path)
     assert len(read_lines(path, "drawn")) == 1
     with pytest.raises(InputError, match="no layer curves; it has drawn, ends, gaps"):

@@ -7,7 +7,7 @@ with no more than a warning, so they stay the cloud's own, and only their unit b
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import shapely
@@ -18,6 +18,8 @@ from vinemap.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
+
+G = TypeVar("G", shapely.Geometry, np.ndarray)
 
 WGS84 = CRS.from_epsg(4326)
 LOCAL = CRS.from_wkt(
@@ -289,8 +291,8 @@ def _topocentric(origin: Origin) -> Transformer:
     )
 
 
-def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geometry:
-    """Bring a geometry, in two dimensions, from one CRS to another.
+def project(shapes: G, source: CRS, target: CRS) -> G:
+    """Bring a geometry, or an array of such, in two dimensions from one CRS to another.
 
     Raises
     ------
@@ -298,12 +300,12 @@ def project(polygon: shapely.Geometry, source: CRS, target: CRS) -> shapely.Geom
         If nothing leads from one to the other.
     """
     if is_local(source) and is_local(target):
-        return shapely.force_2d(polygon)
+        return shapely.force_2d(shapes)
     try:
         convert = transformer(horizontal(source), target).transform
     except ProjError as error:
-        raise InputError(f"polygons in {source.name} can't be brought to {target.name}: check their CRS") from error
-    return shapely.transform(shapely.force_2d(polygon), lambda xy: np.column_stack(convert(*xy.T)))
+        raise InputError(f"shapes in {source.name} can't be brought to {target.name}: check their CRS") from error
+    return shapely.transform(shapely.force_2d(shapes), lambda xy: np.column_stack(convert(*xy.T)))
 
 
 def to_wgs84(xyz: ArrayLike, crs: CRS) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from pyproj import CRS
     from shapely.geometry.base import BaseGeometry
 
 KML = (".kml", ".kmz")
@@ -44,7 +45,13 @@ class Layer(NamedTuple):
 
 
 def read_layers(
-    path: Path, choose: Callable[[Sequence[Layer]], Sequence[Layer]], things: str, *, local: bool = False
+    path: Path,
+    choose: Callable[[Sequence[Layer]], Sequence[Layer]],
+    things: str,
+    *,
+    drawn: bool = False,
+    crs: CRS | None = None,
+    local: bool = False,
 ) -> gpd.GeoDataFrame:
     """Read what some layers of a file hold, as one table.
 
@@ -56,6 +63,10 @@ def read_layers(
         Tells which of its layers are read.
     things : str
         What is looked for, in words.
+    drawn : bool
+        Whether it may stand in drawings, DXF.
+    crs : CRS, optional
+        CRS of coordinates for which the file states none.
     local : bool
         Whether coordinates are local, and need no CRS.
 
@@ -76,13 +87,17 @@ def read_layers(
         raise
     except Exception as error:  # GDAL's errors come in several classes
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: can't be read as GeoPackage, GeoJSON, KML, KMZ or Shapefile ({reason})") from error
+        formats = f"GeoPackage, GeoJSON, KML, KMZ{', DXF' if drawn else ''} or Shapefile"
+        raise InputError(f"{path}: can't be read as {formats} ({reason})") from error
     nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84 if path.suffix.lower() in KML else None)
     frame = pd.concat([table for table in tables if len(table)] or tables or [nothing], ignore_index=True)
     if local and isinstance(frame, gpd.GeoDataFrame) and (frame.crs is None or is_local(frame.crs)):
         frame = frame.set_crs(LOCAL, allow_override=True)
+    elif crs and isinstance(frame, gpd.GeoDataFrame) and frame.crs is None:
+        frame = frame.set_crs(crs)
     if not isinstance(frame, gpd.GeoDataFrame) or frame.crs is None:
-        raise InputError(f"{path}: has no geometry or no CRS: save it with its CRS, or say --crs local of local ones")
+        ways = "save it with its CRS, give it with --rows-crs," if drawn else "save it with its CRS,"
+        raise InputError(f"{path}: has no geometry or no CRS: {ways} or say --crs local of local ones")
     return frame
 
 
