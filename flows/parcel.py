@@ -50,6 +50,8 @@ def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
         boundary=config.boundaries or paths.survey_boundaries(survey),
         crs=parse_crs(config.crs) if config.crs else None,
         survey=survey,
+        rows=config.rows,
+        rows_crs=parse_crs(config.rows_crs) if config.rows_crs else None,
         **dict(config.of_parcel(parcel)),
     )
     products = paths.survey_products(survey)

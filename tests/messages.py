@@ -19,8 +19,10 @@ REMARKS = {
     "jobs/plan.py",
     "product/notices.py",
     "product/pages/parcel.py",
+    "product/recipe.py",
     "product/record.py",
     "product/store.py",
+    "rows/known.py",
 }
 """Files whose sentences are remarks, reasons and warnings."""
 WORDS = 4

@@ -12,8 +12,10 @@ import pytest
 import rasterio
 import shapely
 import trimesh
+from click.testing import CliRunner
 
 from vinemap import paths
+from vinemap.cli.main import commands
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.export.write import export_products
@@ -127,6 +129,44 @@ def test_table_2_1_holds_together(product):
     assert rows["height_m"].between(1.6, 2.3).all()
     assert rows["width_m"].between(0.4, 0.8).all()
     assert (rows["volume_m3"] > 8).all()
+
+
+def test_rows_of_an_earlier_product_are_measured_again(product, survey, tmp_path):
+    """As they were edited: one deleted, one turned round, one renamed, one drawn where nothing stands."""
+    earlier = gpd.read_file(paths.geopackage(product.folder, "A"), layer="rows")
+    edited = earlier[earlier["row_id"] != 3][["row_id", "label", "geometry"]].reset_index(drop=True)
+    turned, bare = edited.geometry[3].reverse(), shapely.affinity.translate(edited.geometry[0], 1.2, -2)
+    shapes = gpd.GeoSeries([*edited.geometry[:3], turned, edited.geometry[4], bare], crs=edited.crs)
+    rows = gpd.GeoDataFrame({"row_id": [*edited["row_id"], 9], "label": [*edited["label"], "new"]}, geometry=shapes)
+    rows.loc[1, "label"] = "Müller's"
+    rows.to_crs(4326).to_file(tmp_path / "rows.gpkg", layer="rows")
+    (tmp_path / "keep.yaml").write_text("rows: {ends: keep}\n")
+    given = {"boundary": survey.parent / "parcels.gpkg", "parcel": "A", "rows": tmp_path / "rows.gpkg"}
+    given |= {"settings": tmp_path / "keep.yaml", "out": tmp_path / "out"}
+    words = ["run", survey, *(word for name, value in given.items() for word in (f"--{name}", value))]
+    done = CliRunner().invoke(commands, [str(word) for word in words], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "A: 6 rows, " in done.output
+    assert "1 of 6 known rows have no canopy: new" in done.output
+    found = gpd.read_file(tmp_path / "out" / "A.gpkg", layer="rows")
+    assert found["row_id"].tolist() == [1, 2, 4, 5, 6, 9]
+    assert found["label"].tolist() == ["1 A", "Müller's", "4 A", "5 A", "6 A", "new"]
+    flat = [shapely.force_2d(frame.geometry.to_numpy()) for frame in (found, rows)]
+    assert shapely.hausdorff_distance(*flat)[:5].max() < 0.03
+    assert shapely.distance(*(shapely.get_point(lines, 0) for lines in flat)).max() < 0.05
+    assert found["support"].tolist()[5] == 0
+    assert found["confidence"][5] < 0.3
+    assert found["confidence"][:5].min() > 0.7
+    assert np.isnan(found["height_m"][5])
+    same = earlier[earlier["row_id"].isin(found["row_id"])].reset_index()
+    for name in ("length_m", "height_m", "width_m", "spacing_m"):
+        assert found[name][:5].to_numpy() == pytest.approx(same[name].to_numpy(), rel=0.03)
+    unmapped = gpd.read_file(tmp_path / "out" / "A.gpkg", layer="unmapped")
+    third = earlier.geometry[earlier["row_id"] == 3].iloc[0].buffer(0.5)
+    assert unmapped.intersection(third).area.sum() > 0.5 * unmapped.area.sum() > 3
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [one["file"] for one in record["inputs"]][1:] == ["parcels.gpkg", "rows.gpkg"]
+    assert set(STAGES) - set(record["seconds"]) == {"Key points", "Clusters"}
 
 
 def test_rasters(product):

@@ -37,11 +37,12 @@ from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.clusters import cluster_rows
 from vinemap.rows.confidence import believed, judge_rows
 from vinemap.rows.curves import trace_rows
-from vinemap.rows.ends import beyond_ends, count_missing
+from vinemap.rows.ends import beyond_ends
 from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
-from vinemap.rows.numbers import describe_rows, number_rows
+from vinemap.rows.known import follow_lines, lines_here, name_rows, space_lines
+from vinemap.rows.numbers import count_missing, describe_rows, number_rows
 from vinemap.surfaces.ceiling import heights_of_vines
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.ground import terrain_model
@@ -93,6 +94,8 @@ class RowMap(NamedTuple):
     n_key_points: int
     rows: gpd.GeoDataFrame
     gaps: gpd.GeoDataFrame
+    remarks: Sequence[str] = ()
+    """What is to be known of known rows: a sentence each."""
 
 
 def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster, Seen]:
@@ -109,6 +112,7 @@ def map_rows(
     settings: Settings | None = None,
     *,
     within: shapely.Geometry | None = None,
+    known: gpd.GeoDataFrame | None = None,
     step: Callable[..., Any] = call,
 ) -> RowMap:
     """Find the rows of a cloud: the chain from the terrain to numbered rows with their gaps (chapter 2).
@@ -121,27 +125,42 @@ def map_rows(
         Settings of the stages.
     within : Geometry, optional
         The polygon to which the points were clipped, in their CRS: rows end where it does.
+    known : GeoDataFrame, optional
+        LineString with ``row_id`` and ``label`` in any CRS: rows that are measured, and no others sought.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
     Raises
     ------
     InputError
-        If the cloud is too wide for one parcel.
+        If the cloud is too wide for one parcel, or no known row lies in it.
     """
     settings = settings or Settings()
     options = settings.model_dump()
     cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
-    cover, levels = step("Canopy cover", canopy_cover, cloud, chm, **options["cover"])
+    lines, remarks = (None, ()) if known is None else lines_here(known, seen, chm.crs)
+    cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
-    key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
-    clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
-    courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     options["fit"]["high"] = settings.cover.high
+    key_points: Any = ()
+    if lines is None:
+        key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
+        clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
+        courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
+    else:
+        lines, within = space_lines(lines, field), None
+        courses = step("Curves", follow_lines, lines, cover, **options["rows"])
     rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, seen, within, **options["fit"])
+    if lines is not None:
+        rows, options["judging"] = space_lines(rows, field), {"min_confidence": 0.0}
     rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm, seen), gaps, **options["judging"])
-    rows, gaps = count_missing(*number_rows(flag_rows(rows), gaps), **options["missing"])
-    return RowMap(cloud, dtm, chm, cover, seen, refine_row_field(field, rows), len(key_points), rows, gaps)
+    if lines is None:
+        rows, gaps = number_rows(flag_rows(rows), gaps)
+    else:
+        rows, gaps, told = name_rows(lines, courses, flag_rows(rows), gaps)
+        remarks = *remarks, *told
+    rows, gaps = count_missing(rows, gaps, **options["missing"])
+    return RowMap(cloud, dtm, chm, cover, seen, refine_row_field(field, rows), len(key_points), rows, gaps, remarks)
 
 
 def map_parcel(
@@ -154,6 +173,8 @@ def map_parcel(
     boundary: Path | None = None,
     crs: CRS | None = None,
     origin: Origin | None = None,
+    rows: Path | None = None,
+    rows_crs: CRS | None = None,
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Map the rows and canopies of one parcel, and leave the product in a folder.
@@ -176,6 +197,8 @@ def map_parcel(
         CRS of the cloud's coordinates, where the file states none or a wrong one.
     origin : Origin, optional
         Origin of {Main}; by default the south-western corner of the parcel at its lowest terrain.
+    rows, rows_crs : Path, CRS, optional
+        Known rows, which aren't sought, as of :func:`vinemap.geo.lines.read_rows`.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -187,7 +210,8 @@ def map_parcel(
     name = check_parcel(parcel)
     if settings:
         check_engine(settings.ground.engine)
-    recipe = recipe_of(cloud, parcel=name, named=named, boundary=boundary, settings=settings, crs=crs, origin=origin)
+    given: dict[str, Any] = {"boundary": boundary, "crs": crs, "origin": origin, "rows": rows, "rows_crs": rows_crs}
+    recipe = recipe_of(cloud, parcel=name, named=named, settings=settings, **given)
     return follow(recipe, folder, step=step)
 
 
@@ -231,7 +255,8 @@ def follow(
         if origin:
             check_near(origin, points.extent[0], points.crs)
         polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
-        found = map_rows(points, settings, within=polygon, step=run)
+        known = recipe.known.lines if recipe.known else None
+        found = map_rows(points, settings, within=polygon, known=known, step=run)
         model, apart = model_canopies(found, settings, step=run), settings.sections.step
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
@@ -259,6 +284,7 @@ def follow(
 
         run("Writing", write)
         about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
+        about["remarks"] = found.remarks
         record = record_of(recipe, found.cloud, layers, (found.dtm, found.chm), origin=main, **about)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)

@@ -130,6 +130,7 @@ def test_defaults_of_settings_are_those_of_the_stages():
     from vinemap.rows.field import estimate_row_field
     from vinemap.rows.fit import fit_rows
     from vinemap.rows.key_points import detect_key_points
+    from vinemap.rows.known import follow_lines
     from vinemap.surfaces.cover import canopy_cover
     from vinemap.surfaces.ground import terrain_model
 
@@ -139,6 +140,7 @@ def test_defaults_of_settings_are_those_of_the_stages():
         "row_field": [estimate_row_field],
         "key_points": [detect_key_points],
         "clustering": [cluster_rows],
+        "rows": [follow_lines],
         "curves": [trace_rows],
         "fit": [fit_rows],
         "sections": [cut_sections],

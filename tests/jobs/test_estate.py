@@ -269,6 +269,22 @@ def test_several_files_of_polygons(clouds, place):
     assert found(place)[0].config.boundaries == place / "may" / "south.geojson"
 
 
+def test_known_rows_are_no_polygons(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    polygons(place / "may" / "north.gpkg")
+    polygons(place / "may" / "Rows.gpkg")
+    config = found(place)[0].config
+    assert (config.boundaries, config.rows) == (place / "may" / "north.gpkg", place / "may" / "Rows.gpkg")
+    (place / "may" / "Rows.gpkg").rename(place / "may" / "plan.gpkg")
+    assert "holds 2 files of polygons" in reasons(place)["may"]
+    (place / "may" / "survey.yaml").write_text("rows: plan.gpkg\nrows_crs: EPSG:3003\nsettings: {rows: {ends: keep}}\n")
+    config = found(place)[0].config
+    assert (config.boundaries, config.rows) == (place / "may" / "north.gpkg", place / "may" / "plan.gpkg")
+    assert (config.rows_crs, config.settings.rows.ends) == ("EPSG:3003", "keep")
+    (place / "may" / "survey.yaml").write_text("rows: none.gpkg\nboundaries: north.gpkg\n")
+    assert "none.gpkg: no such file" in reasons(place)["may"]
+
+
 def test_two_of_one_name(clouds, place):
     put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may.laz", place / "june.laz")
     first = {arrival.name: arrival for arrival in found(place)}

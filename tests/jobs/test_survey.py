@@ -23,7 +23,7 @@ from vinemap.cloud.tiles import Collector
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError, OutputError, WorkerError
 from vinemap.geo.boundaries import read_boundary
-from vinemap.jobs.plan import CURRENT, DONE, FAILED
+from vinemap.jobs.plan import CURRENT, DONE, FAILED, LEFT, plan_survey
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import map_parcel
 from vinemap.product.recipe import product_in
@@ -91,6 +91,27 @@ def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
     assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
     assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS[:2], "inner A", *SURVEYS[2:]]
     assert [path.name for path in folder.parent.iterdir()] == ["products"]
+
+
+def test_known_rows_are_their_parcels(three, cloud, tmp_path):
+    """Where none is known, rows are sought; what lies in no parcel is told."""
+    true = gpd.read_file(three.with_name("truth.gpkg"), layer="rows")
+    known = true[true["parcel"] != "C"][["row", "geometry"]].to_crs(4326)
+    known.to_file(tmp_path / "rows.gpkg", layer="rows")
+    how = {"survey": "three", "cloud": cloud, "rows": tmp_path / "rows.gpkg"}
+    boundaries = cloud.with_name("parcels.gpkg")
+    plan = plan_survey(survey_config(**how, boundaries=boundaries), tmp_path / "products")
+    rows = {recipe.parcel: recipe.known and recipe.known.lines["label"].tolist() for recipe in plan.recipes}
+    assert rows == {"A": [f"{k} A" for k in range(1, 5)], "B": [f"{k} B" for k in range(1, 5)], "C": None}
+    assert plan.settled == []
+    assert plan.sources[-1].path == tmp_path / "rows.gpkg"
+    some = gpd.read_file(boundaries)
+    some[some["name"] != "B"].to_file(tmp_path / "some.gpkg")
+    plan = plan_survey(survey_config(**how, boundaries=tmp_path / "some.gpkg"), tmp_path / "products")
+    (left,) = plan.settled
+    assert (left.state, left.reason) == (LEFT, "rows.gpkg: 4 of 8 known rows lie in no parcel: 1, 2, 3, 4")
+    listed = survey_config(**how, boundaries=tmp_path / "some.gpkg", parcels=["A"])
+    assert plan_survey(listed, tmp_path / "products").settled == []
 
 
 def test_too_short_a_limit_leaves_nothing(cloud, boundaries, tmp_path):

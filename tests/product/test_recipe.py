@@ -85,11 +85,39 @@ def test_the_key_tells_each_ingredient(made, cloud, boundaries, tmp_path, monkey
 def test_every_setting_is_in_the_key(made, stage):
     """One other value of one setting of each stage."""
     options = getattr(Settings(), stage)
-    name, value = next(
-        (name, value) for name, value in options.model_dump().items() if isinstance(value, (int, float)) or not value
-    )
-    changed = options.model_copy(update={name: 1000 if value is None else not value if value is False else value + 1})
+    numbers = {k: v for k, v in options.model_dump().items() if isinstance(v, (int, float)) or not v}
+    name, value = next(iter((numbers or options.model_dump()).items()))
+    other = {type(None): 1000, bool: not value, str: "keep"}.get(type(value))
+    changed = options.model_copy(update={name: value + 1 if other is None else other})
     assert made._replace(settings=Settings().model_copy(update={stage: changed})).key != made.key
+
+
+def test_known_rows_of_the_parcel_are_in_the_key(made, cloud, boundaries, tmp_path):
+    """Where they run, which way, and what they are called; what belongs to another parcel isn't."""
+    x, y = PLACE
+    line = shapely.LineString([(x + 1, y + 2), (x + 13, y + 4)])
+    beside, last = (shapely.transform(line, lambda xy, by=by: xy + by) for by in (20, 100))
+    written = []
+
+    def key(lines, numbers, crs=32632):
+        written.append(tmp_path / f"rows{len(written)}.gpkg")
+        frame = gpd.GeoDataFrame({"row_id": numbers}, geometry=lines, crs=32632).to_crs(crs)
+        frame.to_file(written[-1], layer="rows")
+        recipe = recipe_of(cloud, parcel="A", boundary=boundaries, rows=written[-1])
+        assert recipe.sources[-1].path == written[-1]
+        assert len(recipe.known.lines) == 1
+        told = [f"{len(lines) - 1} known rows lie outside of the parcel, and are left out: 8"] * (len(lines) > 1)
+        assert list(recipe.remarks) == told
+        return recipe.key
+
+    alone = key([line], [7])
+    assert key([line, beside], [7, 8]) == alone
+    assert key([line, last], [7, 8]) == alone
+    others = [key([line.reverse()], [7]), key([line], [6]), key([shapely.transform(line, lambda xy: xy + 0.01)], [7])]
+    assert len({made.key, alone, *others}) == 5
+    assert key([line], [7], 25832) not in {alone, made.key}
+    with pytest.raises(InputError, match=r"none of its 1 rows lies in the parcel: is its CRS the right one\?"):
+        key([last], [8])
 
 
 def test_the_key_tells_nothing_else(made, cloud, boundaries, tmp_path):

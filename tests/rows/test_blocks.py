@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.rows.blocks import group_blocks, outline_blocks
-from vinemap.rows.ends import count_missing, estimate_vine_spacing
+from vinemap.rows.numbers import count_missing, estimate_vine_spacing
 
 
 def rows_frame(lines, spacing=2.5, **columns):

@@ -17,11 +17,9 @@ from vinemap.rows.ends import (
     UNSEEN,
     Standing,
     beyond_ends,
-    count_missing,
-    estimate_vine_spacing,
     lay_out,
 )
-from vinemap.rows.numbers import number_rows
+from vinemap.rows.numbers import count_missing, estimate_vine_spacing, number_rows
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate

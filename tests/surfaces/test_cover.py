@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import grid_over, sample
@@ -72,12 +73,16 @@ def test_huts_do_not_raise_the_level(cloud):
 
 @pytest.mark.parametrize("seed", [3, 14])
 def test_nothing_of_a_roof_of_leaves_is_left(cloud, seed):
-    """Not where single shoots stand out of it, nor at its edges and corners."""
+    """Not where single shoots stand out of it, nor at its edges and corners; but all of it where rows are known."""
     survey = family("pergola", seed)
     points = PointCloud(survey.xyz, cloud.crs)
     points = points.above(terrain_model(points))
-    cover, _ = canopy_cover(points, canopy_height_model(points))
+    chm = canopy_height_model(points)
+    cover, _ = canopy_cover(points, chm)
     assert np.count_nonzero(cover.values > 0.12) * cover.grid.resolution**2 < 1.0
+    known, _ = canopy_cover(points, chm, survey.rows.assign(spacing_m=3.0))
+    along = shapely.line_interpolate_point(survey.rows.geometry.to_numpy()[:, None], np.arange(2.0, 20))
+    assert np.quantile(sample(known, shapely.get_coordinates(along)), 0.1) > 0.5
 
 
 @pytest.mark.parametrize("resolution", [0.1, 0.3, 0.7, 2.0])

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     type=FILE,
     help="Polygon to clip to, in any CRS: GeoPackage, GeoJSON, KML, KMZ or Shapefile, or a .zip of one.",
 )
+@click.option(
+    "--rows", type=FILE, help="Known rows, as lines or posts: measured, none sought. The same formats, and DXF."
+)
+@click.option("--rows-crs", help="CRS of the known rows, as EPSG:n, where their file states none.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--parcel", help="Name of the parcel; the cloud's by default.")
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 def run(
     clouds: tuple[Path, ...],
     boundary: Path | None,
+    rows: Path | None,
+    rows_crs: str | None,
     crs: str | None,
     parcel: str | None,
     out: Path | None,
@@ -56,6 +62,8 @@ def run(
         "crs": parse_crs(crs) if crs else None,
         "settings": chosen.model_copy(update={"product": chosen.product.model_copy(update=extra)}),
         "boundary": boundary,
+        "rows": rows,
+        "rows_crs": parse_crs(rows_crs) if rows_crs else None,
         "origin": origin,
         "named": parcel is not None,
     }

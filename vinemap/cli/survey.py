@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
 @click.option("--boundaries", type=FILE, required=True, help="Polygons of the parcels, named in one of their columns.")
+@click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")
+@click.option("--rows-crs", help="CRS of the known rows, as EPSG:n, where their file states none.")
 @click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 def survey(
     clouds: tuple[Path, ...],
     boundaries: Path,
+    rows: Path | None,
+    rows_crs: str | None,
     parcels: tuple[str, ...],
     crs: str | None,
     out: Path | None,
@@ -50,6 +54,8 @@ def survey(
         survey=name,
         cloud=list(clouds),
         boundaries=boundaries,
+        rows=rows,
+        rows_crs=rows_crs,
         parcels=list(parcels) or None,
         crs=crs,
         origin=origin,

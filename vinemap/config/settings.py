@@ -96,6 +96,13 @@ class ClusteringOptions(Options):
     track_width: Metres = Field(3.5, description="gap shared by the neighbours that is a track (m)")
 
 
+class KnownRowOptions(Options):
+    """Rows that are known, and not sought."""
+
+    course: Literal["fit", "keep"] = Field("fit", description="whether a line moves sideways onto its canopy, or stays")
+    ends: Literal["fit", "keep"] = Field("fit", description="whether its ends move to its canopy's, or stay")
+
+
 class CurveOptions(Options):
     """Courses of rows."""
 
@@ -197,6 +204,7 @@ class Settings(Options):
     row_field: RowFieldOptions = RowFieldOptions()
     key_points: KeyPointOptions = KeyPointOptions()
     clustering: ClusteringOptions = ClusteringOptions()
+    rows: KnownRowOptions = KnownRowOptions()
     curves: CurveOptions = CurveOptions()
     fit: FitOptions = FitOptions()
     judging: JudgingOptions = JudgingOptions()

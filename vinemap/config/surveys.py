@@ -48,6 +48,10 @@ class _Surveys(Options):
     """What is the same for a survey and an estate."""
 
     boundaries: Path | None = Field(None, description="polygons of the parcels, named in one of their columns")
+    rows: Path | None = Field(None, description="known rows: lines, or posts of one name; none: rows are sought")
+    rows_crs: Annotated[str, checked_by(parse_crs)] | None = Field(
+        None, description="CRS of the known rows, as EPSG:n, where their file states none"
+    )
     parcels: list[ParcelName] | None = Field(
         None, min_length=1, description="names of the parcels; none: all that there are"
     )
@@ -123,7 +127,7 @@ class EstateConfig(_Surveys):
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
-            stated |= {key: _beside(own, stated[key]) for key in ("cloud", "boundaries") if stated.get(key)}
+            stated |= {key: _beside(own, stated[key]) for key in ("cloud", "boundaries", "rows") if stated.get(key)}
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}

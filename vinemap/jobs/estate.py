@@ -12,6 +12,7 @@ from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
 from vinemap.geo.layers import layers_in
+from vinemap.geo.lines import ROW_LAYER
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -27,6 +28,8 @@ BEGINNING = 4096
 """Bytes of it."""
 USUAL = ("parcels", "boundaries", "boundary")
 """What the file of the parcels' polygons is called where there are others."""
+ROWS = (*POLYGONS, ".dxf")
+"""Files of known rows, which are called ``rows``."""
 UNUSABLE = {
     "can't be read: unpack it": (
         *(".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".lz4", ".001", ".z01"),
@@ -68,6 +71,7 @@ class _Found(NamedTuple):
 
     clouds: Sequence[Path]
     polygons: Sequence[Path]
+    rows: Path | None
     own: Path | None
     unusable: dict[Path, str]
     partial: Sequence[Path]
@@ -153,10 +157,13 @@ def _arrival(name: str, group: list[Path], estate: EstateConfig, now: float) -> 
 
 def _config(name: str, path: Path, found: _Found, estate: EstateConfig) -> SurveyConfig:
     """What holds for a survey with the files that were found."""
-    config = estate.of_survey(name, found.own, cloud=_several(found.clouds), boundaries=_only(found.polygons))
-    if len(found.polygons) > 1 and not config.boundaries:
+    there: dict[str, Path | list[Path] | None] = {"cloud": _several(found.clouds), "rows": found.rows}
+    rows = estate.of_survey(name, found.own, **there).rows
+    polygons = [p for p in found.polygons if p != rows]
+    config = estate.of_survey(name, found.own, boundaries=_only(polygons), **there)
+    if len(polygons) > 1 and not config.boundaries:
         raise InputError(
-            f"{path}: holds {len(found.polygons)} files of polygons: name one in its {paths.OWN_CONFIGURATION}, "
+            f"{path}: holds {len(polygons)} files of polygons: name one in its {paths.OWN_CONFIGURATION}, "
             "as 'boundaries: FILE'"
         )
     if not config.cloud:
@@ -167,7 +174,7 @@ def _config(name: str, path: Path, found: _Found, estate: EstateConfig) -> Surve
 def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConfig, now: float) -> Arrival:
     """A survey, if its files have stayed as they are, and are there to their ends."""
     clouds = cloud_files(config.cloud or ())
-    used = [p for p in (*clouds, config.boundaries, own) if p]
+    used = [p for p in (*clouds, config.boundaries, config.rows, own) if p]
     for file in used:
         _check(file)
     age = now - max(p.stat().st_mtime for p in used)
@@ -183,17 +190,18 @@ def _found(files: Iterable[Path], folder: Path | None) -> _Found:
     """What is what among the files of a survey."""
     everything = sorted(p for p in files if not p.name.startswith("."))
     shown = [p for p in everything if p.is_file() or not folder]
-    polygons = [p for p in shown if _has_polygons(p)] if folder else []
+    known = [p for p in shown if p.stem.lower() == ROW_LAYER and p.suffix.lower() in ROWS] if folder else []
+    polygons = [p for p in shown if p not in known and _has_polygons(p)] if folder else []
     if len(polygons) > 1:
         polygons = [p for p in polygons if p.stem.lower() in USUAL] or polygons
     own = folder / paths.OWN_CONFIGURATION if folder and (folder / paths.OWN_CONFIGURATION).is_file() else None
     unusable = {p: why for p in shown if (why := _unusable(p))}
     if folder and not polygons:
-        unusable |= {p: NO_POLYGONS for p in everything if p.suffix.lower() in OTHER_POLYGONS}
+        unusable |= {p: NO_POLYGONS for p in everything if p.suffix.lower() in OTHER_POLYGONS and p not in known}
     partial = [p for p in shown if p.suffix.lower() in PARTIAL]
     clouds = once([p for p in everything if is_cloud(p)])
     deeper = _deeper(folder, DEEP[:1] if clouds else DEEP) if folder and not own else []
-    return _Found(clouds, polygons, own, unusable, partial, deeper)
+    return _Found(clouds, polygons, known[0] if known else None, own, unusable, partial, deeper)
 
 
 def _deeper(folder: Path, patterns: Sequence[str]) -> list[Path]:

@@ -13,12 +13,14 @@ from vinemap.config.names import check_parcel
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
+from vinemap.geo.layers import some_of
+from vinemap.geo.lines import KnownRows, read_rows, rows_of
 from vinemap.product.recipe import Recipe, Source, flown, product_in, read_clouds, read_source
 from vinemap.product.record import in_words
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from vinemap.config.surveys import SurveyConfig
 
@@ -83,7 +85,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     Raises
     ------
     InputError
-        If the cloud or the boundaries can't be read.
+        If the cloud, the boundaries or the rows can't be read.
     """
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
@@ -91,14 +93,17 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     clouds = read_clouds(cloud, hashed)
     polygons: dict[str, Parcel | InputError | None]
     crs, listed = parse_crs(config.crs) if config.crs else None, config.parcels is not None
+    local = crs is not None and is_local(crs)
     sources: tuple[Source, ...]
     if config.boundaries is None and config.parcels is None and not boundaries.exists():
         sources, polygons = clouds, {config.survey: None}
     else:
         sources = *clouds, read_source(boundaries, hashed)
-        polygons = {**read_parcels(boundaries, config.parcels, local=crs is not None and is_local(crs))}
+        polygons = {**read_parcels(boundaries, config.parcels, local=local)}
+    sources += (read_source(config.rows, hashed),) if config.rows else ()
+    rows, lost = _known_rows(config, polygons, local=local)
     files, date = tuple(source.path for source in clouds), min(map(flown, clouds))
-    plan = Plan(sources, date, [], [], listed)
+    plan = Plan(sources, date, [], lost, listed)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
     taken: dict[str, str] = {}
@@ -131,6 +136,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             flown=date,
             survey=config.survey,
             remarks=remarks,
+            known=rows.get(name),
         )
         key = recipe.key
         product = None if again else product_in(place)
@@ -142,6 +148,22 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
         else:
             plan.recipes.append(recipe)
     return plan
+
+
+def _known_rows(
+    config: SurveyConfig, polygons: Mapping[str, Parcel | InputError | None], *, local: bool
+) -> tuple[dict[str, KnownRows], list[Outcome]]:
+    """Known rows of each parcel that has some, and what becomes of those that lie in none."""
+    path = config.rows
+    if path is None:
+        return {}, []
+    rows = read_rows(path, crs=parse_crs(config.rows_crs) if config.rows_crs else None, local=local)
+    parcels = {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
+    known, homeless = rows_of(rows, parcels)
+    if not homeless or (known and config.parcels is not None):
+        return known, []
+    reason = f"{path.name}: {len(homeless)} of {len(rows.lines)} known rows lie in no parcel: {some_of(homeless)}"
+    return known, [Outcome("known rows", LEFT, reason=reason)]
 
 
 def _earlier(folder: Path) -> _Earlier:

@@ -44,7 +44,11 @@ LAYERS: dict[str, Layer] = {
         | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha", "canopy_confidence", "unseen_m"), REAL),
         "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
     ),
-    "row_ends": Layer("Point Z", _ROW | {"end": TEXT, "beyond": TEXT}, "Ends of the rows in WGS84, e1 the western one"),
+    "row_ends": Layer(
+        "Point Z",
+        _ROW | {"end": TEXT, "beyond": TEXT},
+        "Ends of the rows in WGS84; e1 is the western one, or a known row's first",
+    ),
     "key_points": Layer("Point Z", _ROW | {"order": WHOLE, "position_m": REAL}, "Enhanced key points along the rows"),
     "sections": Layer(
         "LineString Z",

@@ -17,6 +17,8 @@ from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import read_parcel
 from vinemap.geo.crs import is_local
+from vinemap.geo.layers import some_of
+from vinemap.geo.lines import read_rows, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
     from vinemap.geo.boundaries import Boundary
     from vinemap.geo.crs import Origin
+    from vinemap.geo.lines import KnownRows
 
 SETTLED = 2.0
 """Seconds within which a file can change twice without its time telling."""
@@ -129,6 +132,8 @@ class Recipe(NamedTuple):
     """Name of the survey whose parcels' products lie side by side."""
     remarks: tuple[str, ...] = ()
     """What is to be known of the boundary: a sentence each."""
+    known: KnownRows | None = None
+    """Its rows, where they are known."""
 
     @property
     def flights(self) -> tuple[Source, ...]:
@@ -147,7 +152,7 @@ class Recipe(NamedTuple):
         if self.boundary:
             shape, crs = self.boundary
             polygon = [shapely.to_wkb(shapely.normalize(shape), hex=True), crs.to_string()]
-        parts = {
+        parts: dict[str, Any] = {
             "vinemap": __version__,
             "parcel": self.parcel,
             "cloud": [source.sha256 for source in self.flights],
@@ -157,6 +162,10 @@ class Recipe(NamedTuple):
             "settings": self.settings.model_dump(mode="json"),
             "survey": self.survey,
         }
+        if self.known:
+            lines = self.known.lines
+            shapes = shapely.to_wkb(lines.geometry.to_numpy(), hex=True).tolist()
+            parts["rows"] = lines.crs.to_string(), lines["row_id"].tolist(), lines["label"].tolist(), shapes
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -188,6 +197,8 @@ def recipe_of(
     crs: CRS | None = None,
     origin: Origin | None = None,
     survey: str | None = None,
+    rows: Path | None = None,
+    rows_crs: CRS | None = None,
 ) -> Recipe:
     """Gather what the product of one parcel depends on, as :func:`vinemap.parcel.map_parcel` is told.
 
@@ -199,7 +210,7 @@ def recipe_of(
     Raises
     ------
     InputError
-        If the cloud or the boundary can't be read.
+        If the cloud, the boundary or the rows can't be read, or none of the rows lies in the parcel.
     """
     local = crs is not None and is_local(crs)
     # A product's name by default says nothing of a polygon.
@@ -208,7 +219,17 @@ def recipe_of(
     sources = read_clouds(clouds)
     files, date = tuple(source.path for source in sources), min(map(flown, sources))
     sources += (read_source(boundary),) if boundary else ()
-    return Recipe(parcel, files, sources, polygon, settings or Settings(), crs, origin, date, survey, remarks)
+    known = None
+    if rows:
+        sources += (read_source(rows),)
+        found, outside = rows_of(read_rows(rows, crs=rows_crs, local=local), {parcel: polygon})
+        if parcel not in found:
+            raise InputError(f"{rows}: none of its {len(outside)} rows lies in the parcel: is its CRS the right one?")
+        known = found[parcel]
+        if outside:
+            left = f"{len(outside)} known rows lie outside of the parcel, and are left out: {some_of(outside)}"
+            remarks += (left,)
+    return Recipe(parcel, files, sources, polygon, settings or Settings(), crs, origin, date, survey, remarks, known)
 
 
 def flown(cloud: Source) -> datetime:

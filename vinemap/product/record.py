@@ -15,6 +15,7 @@ from vinemap.product.notices import height_notices, notices, sight_notices
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     import geopandas as gpd
@@ -61,6 +62,7 @@ def record_of(
     origin: Origin | Corner,
     n_key_points: int,
     square: bool = False,
+    remarks: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What ``run.json`` tells, but for times and files.
 
@@ -80,6 +82,8 @@ def record_of(
         Key points that were found.
     square : bool
         Whether rows could as well run another way.
+    remarks : sequence of str
+        What is to be known of known rows.
     """
     dtm, chm = surfaces
     sections = layers["sections"]
@@ -103,11 +107,12 @@ def record_of(
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
         "warnings": _places(recipe, points)
+        + [*(recipe.known.remarks if recipe.known else ()), *remarks]
         + _flights(points, dtm)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
-        + [SQUARE] * square,
+        + [SQUARE] * (square and not recipe.known),
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }
 

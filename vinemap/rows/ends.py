@@ -14,7 +14,7 @@ from vinemap.geo.raster import sample
 from vinemap.rows.centre_line import CELL, runs_above
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from vinemap.compute.arrays import Values
     from vinemap.geo.raster import Raster
@@ -31,43 +31,65 @@ CORE, NARROW = 0.5, 0.5
 """Share of a canopy's half width, and metres to both sides at the least, within which it tells where it ends."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
-NARROWEST, WIDEST = 0.7, 1.6
-"""Metres between vines of a row, at the least and at the most."""
+NEAR, SPREAD = 0.25, 4.0
+"""Metres, and times that known ends are off in the median, by which one may be."""
+ACROSS = 0.5
+"""Cover at the sides of what stands beyond a known end, in that of its middle, from which it runs across the row."""
 USUAL = 1.0
 """Metres between vines that are taken where nothing tells."""
 VERTEX = 0.5
 """Metres between the vertices of a curve."""
+NOTHING = np.empty(0)
 
 
 class Standing(NamedTuple):
-    """Curve (n, 2) between a row's ends, its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
+    """Curve (n, 2), its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
 
-    ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it.
+    ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it. Before
+    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle.
     """
 
     curve: Values
     runs: Values
     contrast: float
-    goes_on: tuple[bool, bool]
+    goes_on: tuple[bool, bool] = (False, False)
+    sides: Values = NOTHING
 
     @property
     def length(self) -> float:
         """Metres from end to end."""
-        return float(self.runs[-1, 1])
+        return float(way_along(self.curve)[-1])
 
     @property
     def empty(self) -> Values:
-        """Stretches (k - 1, 2) between the runs, in metres along the curve."""
-        return np.column_stack([self.runs[:-1, 1], self.runs[1:, 0]])
+        """Stretches (k + 1, 2) before, between and after the runs, in metres along the curve."""
+        return np.concatenate([[0.0], self.runs.ravel(), [self.length]]).reshape(-1, 2)
 
 
-def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float) -> Standing | None:
-    """Cut a curve to where its canopy begins and ends; None where there is none.
+class Known(NamedTuple):
+    """What is known of a row: metres at which it begins and ends along the curve on which it is looked for.
 
-    Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out.
+    Either may be off by up to ``slack`` metres; the course may be if it ``moves``. Canopy has ``least`` metres of full
+    cover across it.
+    """
+
+    start: float
+    end: float
+    slack: float
+    moves: bool
+    least: float
+
+
+def find_canopy(
+    curve: Values, image: Values, ridge: Values, end_share: float, *, least: float = 0.0
+) -> Standing | None:
+    """Find the canopy along a curve; None where there is none.
+
+    Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out. From so many
+    metres of full cover across on there may be canopy.
     """
     profile = _core(image).sum(axis=1) * CELL
-    present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
+    present = profile[profile > max(0.3 * np.quantile(profile, 0.95), least)]
     if len(present) == 0:
         return None
     typical = float(np.median(present))
@@ -81,16 +103,66 @@ def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float)
     full = runs_above(profile, edge)
     runs = [(f[0, 0], f[-1, 1]) for a, b in weak if len(f := full[(full[:, 0] >= a) & (full[:, 1] <= b)])]
     metres = np.interp(np.reshape(runs, (-1, 2)), np.arange(len(curve)), way_along(curve))
-    metres = metres[np.diff(metres, axis=1)[:, 0] >= SHORTEST]
-    if len(metres) == 0:
+    long = np.diff(metres, axis=1)[:, 0] >= SHORTEST
+    if not long.any():
         return None
-    canopy = ridge[profile > edge]
-    aside = max(1, canopy.shape[1] // 8)
-    beside = np.concatenate([canopy[:, :aside], canopy[:, -aside:]], axis=1).mean()
-    contrast = float(np.clip(1 - beside / canopy.max(axis=1).mean(), 0, 1))
-    first, last = metres[0, 0], metres[-1, 1]
+    sides = np.array([_sides(ridge[int(a) : int(b) + 1]) for a, b in np.array(runs)[long]])
+    contrast = float(np.clip(1 - _sides(ridge[profile > edge]), 0, 1))
+    return Standing(curve, metres[long], contrast, sides=sides)
+
+
+def _sides(image: Values) -> float:
+    """Cover at both sides of a straightened row, in that of its ridge."""
+    aside, ridge = max(1, image.shape[1] // 8), float(image.max(axis=1).mean())
+    beside = float(np.concatenate([image[:, :aside], image[:, -aside:]], axis=1).mean())
+    return beside / ridge if ridge else 1.0
+
+
+def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float) -> Standing | None:
+    """Cut a curve to where its canopy begins and ends, as of :func:`find_canopy`; None where there is none."""
+    row = find_canopy(curve, image, ridge, end_share)
+    if row is None:
+        return None
+    first, last = row.runs[0, 0], row.runs[-1, 1]
     goes_on = bool(first < USUAL), bool(last > way_along(curve)[-1] - USUAL)
-    return Standing(between(curve, first, last), metres - first, contrast, goes_on)
+    return Standing(between(curve, first, last), row.runs - first, row.contrast, goes_on)
+
+
+def cut_as_known(rows: Sequence[Standing], known: Sequence[Known]) -> list[Standing]:
+    """Cut rows to where they are known to begin and end, or to canopy that is seen to do so near there.
+
+    How near is told by all: where most known ends lie by canopy's, a row's missing vines don't shorten it.
+    """
+    bounds = np.array([(one.start, one.end) for one in known])
+    seen = np.array([_ends_near(row, one) for row, one in zip(rows, known, strict=True)])
+    off = np.abs(seen - bounds)
+    most = NEAR + SPREAD * float(np.median(off[np.isfinite(off)])) if np.isfinite(off).any() else 0.0
+    places = np.where(off <= most, seen, bounds)
+    places = np.where(np.diff(places) > 0, places, bounds)
+    out = []
+    for row, (start, end) in zip(rows, places, strict=True):
+        runs = np.clip(row.runs, start, end)
+        runs = runs[np.diff(runs, axis=1)[:, 0] > 0]
+        out.append(Standing(between(row.curve, start, end), runs - start, row.contrast))
+    return out
+
+
+def _ends_near(row: Standing, known: Known) -> tuple[float, float]:
+    """Metres at which a row's canopy is seen to begin and end near where it is known to; NaN where it isn't."""
+    whole = float(way_along(row.curve)[-1])
+    first = _end_near(whole - row.runs[::-1, ::-1], row.sides[::-1], whole - known.start, whole, known.slack)
+    return whole - first, _end_near(row.runs, row.sides, known.end, whole, known.slack)
+
+
+def _end_near(runs: Values, sides: Values, known: float, whole: float, slack: float) -> float:
+    """Metres at which the last run of canopy near a known end ends, and no hedge or row across; NaN where none does.
+
+    What is looked at ends far beyond, or half way to another row.
+    """
+    ends = (runs[:, 1] <= whole - SHORTEST) | (whole - known < slack)
+    near = (np.abs(runs[:, 1] - known) <= slack) & ends
+    own = np.flatnonzero(near & ((runs[:, 0] < known) | (sides <= ACROSS)))
+    return float(runs[own[-1], 1]) if len(own) else np.nan
 
 
 def _core(image: Values) -> Values:
@@ -148,7 +220,7 @@ def lay_out(
             found = _gaps_of(row, seen, min_gap)
             gaps += [(len(rows), a, b, b - a, state, _line(between(row.curve, a, b), dtm)) for a, b, state in found]
             bare, hidden = (sum(b - a for a, b, state in found if state == one) for one in (MISSING, UNSEEN))
-            support = float((row.length - np.diff(row.empty, axis=1).sum()) / (row.length - hidden))
+            support = float(np.diff(row.runs, axis=1).sum() / max(row.length - hidden, CELL))
             line = _line(resample(row.curve, VERTEX), dtm)
             rows.append((spacing, float(bare), float(hidden), support, row.contrast, line))
     return (
@@ -165,7 +237,7 @@ def _parted(row: Standing, within: shapely.Geometry | None, least: float) -> lis
     way, parts = way_along(row.curve), []
     outside = np.cumsum(np.append(~inside[:-1] * np.diff(way), 0.0))
     cuts = np.flatnonzero(np.diff(np.interp(row.empty, way, outside), axis=1)[:, 0] >= least)
-    for whole in np.split(row.runs, cuts + 1):
+    for whole in np.split(row.runs, cuts):
         own = way[inside & (way >= whole[0, 0]) & (way <= whole[-1, 1])]
         held = np.clip(whole, *own[[0, -1]]) if len(own) else whole[:0]
         held = held[held[:, 1] > held[:, 0]]  # canopy may have seemed to reach a little beyond
@@ -234,49 +306,3 @@ def _line(curve: Values, dtm: Raster) -> shapely.LineString:
 def _frame(records: list[tuple[object, ...]], columns: list[str], dtm: Raster) -> gpd.GeoDataFrame:
     data = {name: [r[k] for r in records] for k, name in enumerate(columns)}
     return gpd.GeoDataFrame(data, geometry=[r[-1] for r in records], crs=dtm.crs)
-
-
-def count_missing(
-    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, vine_spacing: float | None = None
-) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
-    """Count the vines missing in every gap, but for those of which nothing was seen.
-
-    Parameters
-    ----------
-    rows, gaps : GeoDataFrame
-        With ``row_id``; gaps with ``start_m``, ``end_m``, ``length_m`` and ``state``.
-    vine_spacing : float, optional
-        Metres between vines in a row; by default estimated from the gaps, and 1 m where they tell nothing.
-
-    Returns
-    -------
-    rows, gaps : GeoDataFrame
-        With ``n_missing``; rows with ``vine_spacing_m`` too.
-    """
-    spacing = vine_spacing or estimate_vine_spacing(gaps) or USUAL
-    n = np.maximum(1, np.rint(gaps["length_m"].to_numpy(dtype=float) / spacing)).astype(np.int64)
-    gaps = gaps.assign(n_missing=np.where(gaps["state"] == UNSEEN, 0, n))
-    missing = gaps.groupby("row_id")["n_missing"].sum().reindex(rows["row_id"], fill_value=0)
-    return rows.assign(n_missing=missing.to_numpy(), vine_spacing_m=spacing), gaps
-
-
-def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
-    """Distance of vines in metres, from where gaps begin and end along their rows.
-
-    Vines stand at equal distances, so the beginnings of a row's gaps lie whole numbers of vines apart, and so do
-    their ends, but for what wasn't seen. The spacing is where the sum of the rows' periodograms peaks; None where the
-    peak isn't clear.
-    """
-    frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
-    power, spread = np.zeros(len(frequency)), 0.0
-    row, hidden = gaps["row_id"].to_numpy(), (gaps["state"] == UNSEEN).to_numpy(dtype=bool)
-    # A number for each place of each row.
-    start, end = (row + 1j * gaps[edge].to_numpy(dtype=float) for edge in ("start_m", "end_m"))
-    for edge, other in ((start, end), (end, start)):
-        told = np.sort_complex(edge[~hidden & ~np.isin(edge, other[hidden])])
-        for at in np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1):
-            power += np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
-            spread += len(at) * (len(at) - 1)
-    # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
-    clear = spread > 0 and power.max() > 5 * np.sqrt(spread)
-    return float(1 / frequency[power.argmax()]) if clear else None

@@ -8,7 +8,7 @@ parcel's place nor its rotation matters.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -17,10 +17,10 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import extend, normals, resample, smoothed, way_along
+from vinemap.geo.curve import between, extend, normals, resample, smoothed, way_along
 from vinemap.geo.raster import Raster, cells_in, nearest_cell
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths
-from vinemap.rows.ends import Standing, cut_to_canopy, lay_out
+from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -67,6 +67,7 @@ class _Share(NamedTuple):
     left: Values
     body: Values
     ridge: Values
+    known: Known | None
 
 
 def fit_rows(
@@ -89,7 +90,8 @@ def fit_rows(
     ----------
     courses : GeoDataFrame
         LineString with ``spacing_m``, ``curtains_m`` (between two curtains of a row, 0 where it has one) and ``alone``
-        (whether no other row runs beside it).
+        (whether no other row runs beside it). Of known rows, which stay without canopy, too, with ``moves``,
+        ``slack_m``, ``before_m``, ``after_m`` and ``least_m`` as of :func:`vinemap.rows.known.follow_lines`.
     cloud : PointCloud or TiledCloud
         The parcel's points with their heights above ground.
     cover : Raster
@@ -109,13 +111,15 @@ def fit_rows(
     min_gap : float
         Metres without canopy that make a gap.
     """
-    curves = [_smooth_course(shapely.get_coordinates(line)) for line in courses.geometry]
+    looked_at = [_looked_at(course) for course in courses.to_dict("records")]
+    curves = [curve for curve, _ in looked_at]
     curtains = courses["curtains_m"].to_numpy()
     half = np.maximum(half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
     fits: dict[int, Standing | None] = {}
     members, vines = np.arange(len(curves)), _where_vines_are(cover, levels, half)
     for _ in range(1 + FARTHER):
-        for group, shares in _deal(cloud, vines, levels, curves, half[members], curtains[members], high):
+        known = [looked_at[k][1] for k in members]
+        for group, shares in _deal(cloud, vines, levels, curves, half[members], curtains[members], known, high):
             found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
             fits |= dict(zip(members[group].tolist(), found, strict=True))
         unended = _unended(fits, half)
@@ -123,6 +127,8 @@ def fit_rows(
             break
         members = np.array(list(unended))
         curves = [_smooth_course(curve) for curve in unended.values()]
+    if settled := [of for _, of in looked_at if of]:
+        fits = dict(enumerate(cut_as_known([row for _, row in sorted(fits.items()) if row], settled)))
     standing = [
         (spacing, fit)
         for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True))
@@ -133,19 +139,28 @@ def fit_rows(
 
 def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
     """Centre line of a row about its course, between the ends of its canopy."""
-    still = np.zeros(len(share.curve))
+    still, known = np.zeros(len(share.curve)), share.known
+    if known and len(share.station) == 0:
+        return Standing(share.curve, np.empty((0, 2)), 0.0)
     image, offsets = _straighten(share, share.body, still)
     # Crowns lean to the side from which they were seen: where canopies stand apart whole, their flanks tell more.
     if share.ridge is not share.body and not _stands_apart(image):
         image, offsets = _straighten(share, share.ridge, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
     reach = _reach(image, offsets, share.half)
-    shift = centre_line(image, offsets, reach=reach, cutoff=cutoff, curtains=share.curtains)
+    shift: Values = still
+    if known is None or known.moves:
+        shift = centre_line(image, offsets, reach=reach, cutoff=cutoff, curtains=share.curtains)
+    if known and len(canopy := np.flatnonzero(image.sum(axis=1) * CELL > known.least)):
+        shift = shift[np.clip(np.arange(len(shift)), canopy[0], canopy[-1])]
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
     body = ridge = _straighten(share, share.body, shift)[0]
     if share.ridge is not share.body:
         ridge = _straighten(share, share.ridge, shift)[0]
-    return cut_to_canopy(centred, body, ridge, end_share)
+    if known is None:
+        return cut_to_canopy(centred, body, ridge, end_share)
+    row = find_canopy(centred, body, ridge, end_share, least=known.least)
+    return row or Standing(centred, np.empty((0, 2)), 0.0)
 
 
 def _unended(fits: dict[int, Standing | None], half: Values) -> dict[int, Values]:
@@ -188,9 +203,21 @@ def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags
     return vines, cover.grid
 
 
-def _smooth_course(course: Values) -> Values:
+def _looked_at(course: dict[str, Any]) -> tuple[Values, Known | None]:
+    """The curve along which a row's canopy is looked for, and what is known of the row."""
+    xy = shapely.get_coordinates(course["geometry"])
+    if "moves" not in course:
+        return _smooth_course(xy), None
+    before, after = course["before_m"], course["after_m"]
+    beyond = float(np.ceil(max(before, after) / MARGIN)) * MARGIN
+    curve = _smooth_course(xy, beyond=beyond) if course["moves"] else extend(xy, beyond)
+    curve = resample(between(curve, beyond - before, way_along(curve)[-1] - beyond + after), CELL)
+    return curve, Known(before, way_along(curve)[-1] - after, course["slack_m"], course["moves"], course["least_m"])
+
+
+def _smooth_course(course: Values, *, beyond: float = MARGIN) -> Values:
     """Course without the bends that the centre line is to find, carried on beyond its ends."""
-    return resample(smoothed(course, wavelength=COURSE, beyond=MARGIN, step=5 * CELL), CELL)
+    return resample(smoothed(course, wavelength=COURSE, beyond=beyond, step=5 * CELL), CELL)
 
 
 def _deal(
@@ -200,6 +227,7 @@ def _deal(
     curves: Sequence[Values],
     half: Values,
     curtains: Values,
+    known: Sequence[Known | None],
     high: float,
 ) -> Iterator[tuple[Ints, list[_Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
@@ -226,7 +254,7 @@ def _deal(
             apart = ridge is body or np.array_equal(body[mine], ridge[mine])
             columns = (body[mine],) * 2 if apart else (body[mine], ridge[mine])
             about = float(half[row]), float(curtains[row])
-            shares.append(_Share(curves[row], *about, near.along[mine] * scale, near.left[mine], *columns))
+            shares.append(_Share(curves[row], *about, near.along[mine] * scale, near.left[mine], *columns, known[row]))
         yield rows, shares
 
 

@@ -1,4 +1,4 @@
-"""Table 2.1: rows numbered across the rows, each with its length, orientation, elevation and two end points."""
+"""Table 2.1: rows numbered across the rows, each with its length, orientation, elevation, ends and missing vines."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import numpy as np
 import shapely
 
 from vinemap.geo.crs import WGS84, Corner, Origin, is_local, to_main, to_wgs84
+from vinemap.rows.ends import UNSEEN, USUAL
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.compute.arrays import Floats, Ints
+
+NARROWEST, WIDEST = 0.7, 1.6
+"""Metres between vines of a row, at the least and at the most."""
 
 
 def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -82,6 +86,52 @@ def _order_across(rows: gpd.GeoDataFrame) -> Ints:
     return order
 
 
+def count_missing(
+    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, *, vine_spacing: float | None = None
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Count the vines missing in every gap, but for those of which nothing was seen.
+
+    Parameters
+    ----------
+    rows, gaps : GeoDataFrame
+        With ``row_id``; gaps with ``start_m``, ``end_m``, ``length_m`` and ``state``.
+    vine_spacing : float, optional
+        Metres between vines in a row; by default estimated from the gaps, and 1 m where they tell nothing.
+
+    Returns
+    -------
+    rows, gaps : GeoDataFrame
+        With ``n_missing``; rows with ``vine_spacing_m`` too.
+    """
+    spacing = vine_spacing or estimate_vine_spacing(gaps) or USUAL
+    n = np.maximum(1, np.rint(gaps["length_m"].to_numpy(dtype=float) / spacing)).astype(np.int64)
+    gaps = gaps.assign(n_missing=np.where(gaps["state"] == UNSEEN, 0, n))
+    missing = gaps.groupby("row_id")["n_missing"].sum().reindex(rows["row_id"], fill_value=0)
+    return rows.assign(n_missing=missing.to_numpy(), vine_spacing_m=spacing), gaps
+
+
+def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
+    """Distance of vines in metres, from where gaps begin and end along their rows.
+
+    Vines stand at equal distances, so the beginnings of a row's gaps lie whole numbers of vines apart, and so do
+    their ends, but for what wasn't seen. The spacing is where the sum of the rows' periodograms peaks; None where the
+    peak isn't clear.
+    """
+    frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
+    power, spread = np.zeros(len(frequency)), 0.0
+    row, hidden = gaps["row_id"].to_numpy(), (gaps["state"] == UNSEEN).to_numpy(dtype=bool)
+    # A number for each place of each row.
+    start, end = (row + 1j * gaps[edge].to_numpy(dtype=float) for edge in ("start_m", "end_m"))
+    for edge, other in ((start, end), (end, start)):
+        told = np.sort_complex(edge[~hidden & ~np.isin(edge, other[hidden])])
+        for at in np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1):
+            power += np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
+            spread += len(at) * (len(at) - 1)
+    # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
+    clear = spread > 0 and power.max() > 5 * np.sqrt(spread)
+    return float(1 / frequency[power.argmax()]) if clear else None
+
+
 def describe_rows(
     rows: gpd.GeoDataFrame, *, parcel: str, origin: Origin | Corner, threshold: float = 2.0
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -90,7 +140,7 @@ def describe_rows(
     Parameters
     ----------
     rows : GeoDataFrame
-        LineStringZ in a projected or local CRS with ``row_id``.
+        LineStringZ in a projected or local CRS with ``row_id``, and ``label`` where they are known by one.
     parcel : str
         Name that follows the number in a row's label ("1 F").
     origin : Origin or Corner
@@ -110,7 +160,7 @@ def describe_rows(
     key_points : GeoDataFrame
         PointZ with ``row_id``, ``label``, ``order`` (1 … n) and ``position_m`` along γ.
     """
-    labels = [f"{i} {parcel}" for i in rows["row_id"]]
+    labels = list(rows["label"]) if "label" in rows else [f"{i} {parcel}" for i in rows["row_id"]]
     lines = [shapely.get_coordinates(line, include_z=True) for line in rows.geometry]
     n_points = np.array([max(2, round(_length(xyz) / threshold) + 1) for xyz in lines], dtype=np.int64)
     ends = np.array([xyz[[0, -1]] for xyz in lines]).reshape(-1, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 from scipy.ndimage import (
     binary_dilation,
     binary_erosion,
@@ -20,6 +21,7 @@ from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coars
 from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
+    import geopandas as gpd
     from numpy.typing import NDArray
 
     from vinemap.cloud.tiles import Cloud
@@ -74,6 +76,7 @@ class Levels(NamedTuple):
 def canopy_cover(
     cloud: Cloud,
     chm: Raster,
+    rows: gpd.GeoDataFrame | None = None,
     *,
     resolution: float = 0.1,
     low: float = 0.5,
@@ -91,6 +94,8 @@ def canopy_cover(
         The parcel's points with their heights above ground.
     chm : Raster
         Canopy height.
+    rows : GeoDataFrame, optional
+        LineString with ``spacing_m``: known rows. Between them, and within half a spacing, nothing is too wide.
     resolution : float
         Cell size in metres.
     low, high : float
@@ -119,7 +124,11 @@ def canopy_cover(
     touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
     if touching.any():
         touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
+    squares = Grid(grid.west, grid.north, side, *blocks[0].shape)
+    about = _about(rows, squares)
     roofs = _roofs(chm, everything, body, grid, high)
+    if about.any():
+        roofs &= ~about.ravel()[cells_in(squares, chm.grid)]
     apart = _apart(touching, body, crown, grid, metres, resolution)
     apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
@@ -131,7 +140,7 @@ def canopy_cover(
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
     cover /= blurred + np.float32(0.1 * density)
-    no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side).repeat(k, axis=0).repeat(k, axis=1)
+    no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side, about).repeat(k, axis=0).repeat(k, axis=1)
     cover[no_vines[: grid.ny, : grid.nx]] = 0.0
     if roofs.any():
         cover[_grown(roofs, MARGIN, chm.grid.resolution).ravel()[cells_in(chm.grid, grid)]] = 0.0
@@ -229,11 +238,22 @@ def _closed(total: Values, high: Values, side: float, width: float) -> Flags:
     return _grown(binary_erosion(closed, _disc(width / 2, side)), width / 2, side)
 
 
-def _no_vines(total: Values, canopy: Values, above: Values, side: float) -> Flags:
-    """Blocks of cells of objects taller or wider than a row of vines, with half a metre around them."""
+def _about(rows: gpd.GeoDataFrame | None, blocks: Grid) -> Flags:
+    """Blocks of cells between known rows, and within half a spacing of them."""
+    if rows is None:
+        return np.zeros(blocks.shape, dtype=bool)
+    spacing = rows["spacing_m"].to_numpy()
+    strips = shapely.union_all(shapely.buffer(shapely.force_2d(rows.geometry.to_numpy()), spacing))
+    inside = shapely.buffer(strips, -float(np.median(spacing)) / 2)
+    out: Flags = np.asarray(shapely.contains_xy(inside, *np.meshgrid(*blocks.centres())))
+    return out
+
+
+def _no_vines(total: Values, canopy: Values, above: Values, side: float, rows: Flags) -> Flags:
+    """Blocks of cells of objects taller, or but for known rows wider, than vines, with half a metre around them."""
     tall = _around(above)
     high = binary_opening((tall > 2.5) & (tall > 0.15 * _around(total)), np.ones((3, 3)))
-    return _grown(high | _closed(total, canopy + above, side, WIDEST), 0.5, side)
+    return _grown(high | (_closed(total, canopy + above, side, WIDEST) & ~rows), MARGIN, side)
 
 
 def _around(blocks: Values) -> Values:
