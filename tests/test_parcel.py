@@ -19,7 +19,8 @@ from vinemap.cli.main import commands
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.export.write import export_products
-from vinemap.geo.crs import LOCAL, Origin, main_to_wgs84
+from vinemap.geo.crs import LOCAL
+from vinemap.geo.main import Origin, main_to_wgs84
 from vinemap.parcel import STAGES, call, map_parcel
 from vinemap.product.layers import LAYERS
 from vinemap.simulate.plants import Vineyard

@@ -20,7 +20,7 @@ from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.geo.boundaries import read_boundary
-from vinemap.geo.crs import Origin
+from vinemap.geo.main import Origin
 from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
 from vinemap.surfaces.ground import terrain_model
 

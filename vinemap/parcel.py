@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
-    from vinemap.geo.crs import Origin
+    from vinemap.geo.main import Origin
     from vinemap.geo.raster import Raster
     from vinemap.surfaces.seen import Seen
     from vinemap.surfaces.waves import RowField

@@ -10,8 +10,8 @@ import shapely
 from vinemap.export.field import Field
 from vinemap.export.lanes import lanes_between, resampled
 from vinemap.export.nav2 import write_nav2
-from vinemap.geo.crs import Corner
 from vinemap.geo.holes import comes_back
+from vinemap.geo.main import Corner
 
 
 def field(*lines, spacing=2.5, block=1, **columns):

@@ -16,7 +16,7 @@ from vinemap import paths
 from vinemap.canopy.mesh import volume
 from vinemap.errors import InputError
 from vinemap.export.write import export_products
-from vinemap.geo.crs import Origin, main_to_wgs84, to_main
+from vinemap.geo.main import Origin, main_to_wgs84, to_main
 from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb, write_glb
 from vinemap.simulate.plants import Vineyard

@@ -8,18 +8,8 @@ import pytest
 from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import (
-    Origin,
-    from_wgs84,
-    main_to_wgs84,
-    metric_crs,
-    parse_crs,
-    to_main,
-    to_wgs84,
-    vertical_name,
-    vertical_unit,
-    wgs84_to_main,
-)
+from vinemap.geo.crs import from_wgs84, metric_crs, parse_crs, to_wgs84, vertical_name, vertical_unit
+from vinemap.geo.main import Origin, main_to_wgs84, to_main, wgs84_to_main
 
 TABLE = pd.read_csv(Path(__file__).parents[2] / "data" / "table_2_1.csv")
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)

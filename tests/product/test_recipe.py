@@ -15,7 +15,8 @@ from systems import POSIX
 
 from vinemap.config.settings import Settings
 from vinemap.errors import BusyError, InputError
-from vinemap.geo.crs import Origin, parse_crs
+from vinemap.geo.crs import parse_crs
+from vinemap.geo.main import Origin
 from vinemap.product import recipe
 from vinemap.product.recipe import Source, flown, product_in, read_source, recipe_of
 

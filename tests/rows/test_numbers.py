@@ -9,7 +9,8 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.geo.crs import Origin, from_wgs84
+from vinemap.geo.crs import from_wgs84
+from vinemap.geo.main import Origin
 from vinemap.rows.blocks import group_blocks
 from vinemap.rows.numbers import describe_rows, number_rows
 

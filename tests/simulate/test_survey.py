@@ -10,7 +10,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from vinemap.geo.crs import to_main
+from vinemap.geo.main import to_main
 from vinemap.paths import TABLE_2_1
 from vinemap.simulate.families import family
 from vinemap.simulate.plants import Vineyard

@@ -28,7 +28,7 @@ class OriginParam(click.ParamType):  # type: ignore[type-arg]
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The origin in a text, checked."""
-        from vinemap.geo.crs import Origin, check_origin
+        from vinemap.geo.main import Origin, check_origin
 
         try:
             lat, lon, alt = (float(part) for part in str(value).split(","))

@@ -12,7 +12,7 @@ from vinemap.config.names import Name
 from vinemap.config.settings import OdometryOptions, Options
 from vinemap.config.yaml_files import checked_by, read_yaml, validated
 from vinemap.errors import ConfigError
-from vinemap.geo.crs import Origin, check_origin
+from vinemap.geo.main import Origin, check_origin
 
 
 class Start(NamedTuple):

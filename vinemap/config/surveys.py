@@ -12,7 +12,8 @@ from vinemap.config.names import Name, ParcelName, check_parcel
 from vinemap.config.settings import Options, Settings
 from vinemap.config.yaml_files import checked_by, merge, nearest, read_yaml, validated
 from vinemap.errors import ConfigError
-from vinemap.geo.crs import Origin, check_origin, parse_crs
+from vinemap.geo.crs import parse_crs
+from vinemap.geo.main import Origin, check_origin
 
 MainOrigin = Annotated[Origin, checked_by(check_origin)]
 

@@ -15,7 +15,8 @@ from pyogrio.errors import DataLayerError, DataSourceError
 from vinemap import paths
 from vinemap.errors import InputError
 from vinemap.export.lanes import lanes_between
-from vinemap.geo.crs import WGS84, Corner, Origin, is_local, origin_of, to_main
+from vinemap.geo.crs import WGS84, is_local
+from vinemap.geo.main import Corner, Origin, origin_of, to_main
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

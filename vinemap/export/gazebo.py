@@ -13,7 +13,7 @@ from vinemap import paths
 from vinemap.canopy.mesh import Mesh
 from vinemap.errors import InputError
 from vinemap.export.meshes import place_canopies, write_obj
-from vinemap.geo.crs import Corner, Origin, to_main
+from vinemap.geo.main import Corner, Origin, to_main
 
 if TYPE_CHECKING:
     from pathlib import Path

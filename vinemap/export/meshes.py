@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vinemap import paths
-from vinemap.geo.crs import is_local, to_main
+from vinemap.geo.crs import is_local
+from vinemap.geo.main import to_main
 from vinemap.product.gltf import read_glb
 
 if TYPE_CHECKING:

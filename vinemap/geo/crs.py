@@ -1,4 +1,4 @@
-"""Coordinate systems: the metric CRS of a parcel, the local frame {Main}, and WGS84.
+"""Coordinate systems: the metric CRS of a parcel, and WGS84.
 
 Heights are never moved between vertical datums: without geoid grids PROJ would leave them unchanged
 with no more than a warning, so they stay the cloud's own, and only their unit becomes the metre.
@@ -7,14 +7,14 @@ with no more than a warning, so they stay the cloud's own, and only their unit b
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import shapely
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from vinemap.errors import ConfigError, InputError
+from vinemap.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -38,48 +38,6 @@ LIKELY = 70
 """Confidence, of 100, with which PROJ knows a CRS by its numbers alone."""
 SCALE_TOLERANCE = 0.002
 """A projection that stretches lengths by more than this is not used for measuring (Web Mercator, say)."""
-
-
-class Origin(NamedTuple):
-    """Origin of {Main}: WGS84 latitude and longitude in degrees, altitude in metres."""
-
-    lat: float
-    lon: float
-    alt: float
-
-
-class Corner(NamedTuple):
-    """Origin of {Main} in local coordinates, in metres; there {Main} is their own frame, shifted."""
-
-    x: float
-    y: float
-    z: float
-
-    @property
-    def alt(self) -> float:
-        """Its height (m), as an :class:`Origin` tells it."""
-        return self.z
-
-
-def origin_of(numbers: dict[str, float]) -> Origin | Corner:
-    """Origin of {Main} as a product's record has it; TypeError if it is none."""
-    return Corner(**numbers) if "x" in numbers else Origin(**numbers)
-
-
-def check_origin(origin: Origin) -> Origin:
-    """Return an origin that lies on the globe.
-
-    Raises
-    ------
-    ConfigError
-        If it doesn't.
-    """
-    if not (abs(origin.lat) <= 90 and abs(origin.lon) <= 180 and abs(origin.alt) < 10_000):
-        raise ConfigError(
-            f"origin {origin.lat:g}, {origin.lon:g}, {origin.alt:g} lies nowhere: give latitude and longitude in "
-            "degrees and altitude in metres"
-        )
-    return origin
 
 
 def parse_crs(text: str) -> CRS:
@@ -283,14 +241,6 @@ def transformer(source: CRS, target: CRS) -> Transformer:
     return Transformer.from_crs(source, target, always_xy=True)
 
 
-@lru_cache(maxsize=32)
-def _topocentric(origin: Origin) -> Transformer:
-    return Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lat_0={origin.lat!r} +lon_0={origin.lon!r} +h_0={origin.alt!r}"
-    )
-
-
 def project(shapes: G, source: CRS, target: CRS) -> G:
     """Bring a geometry, or an array of such, in two dimensions from one CRS to another.
 
@@ -325,28 +275,3 @@ def from_wgs84(lat_lon_alt: ArrayLike, crs: CRS) -> NDArray[np.float64]:
     points = np.atleast_2d(np.asarray(lat_lon_alt, dtype=float))
     x, y, _ = transformer(WGS84, crs).transform(points[:, 1], points[:, 0], points[:, 2])
     return np.column_stack([x, y, points[:, 2]])
-
-
-def wgs84_to_main(lat_lon_alt: ArrayLike, origin: Origin) -> NDArray[np.float64]:
-    """Points (n, 3) in {Main}: the topocentric frame (east, north, up) at ``origin``, in metres.
-
-    Table 2.1's two halves agree in this frame to 3 mm.
-    """
-    points = np.atleast_2d(np.asarray(lat_lon_alt, dtype=float))
-    return np.column_stack(_topocentric(origin).transform(points[:, 1], points[:, 0], points[:, 2]))
-
-
-def main_to_wgs84(xyz: ArrayLike, origin: Origin) -> NDArray[np.float64]:
-    """Latitude, longitude (degrees) and altitude (m) of points (n, 3) in {Main}."""
-    points = np.atleast_2d(np.asarray(xyz, dtype=float))
-    x, y, z = points.T
-    lon, lat, alt = _topocentric(origin).transform(x, y, z, direction="INVERSE")
-    return np.column_stack([lat, lon, alt])
-
-
-def to_main(xyz: ArrayLike, crs: CRS, origin: Origin | Corner) -> NDArray[np.float64]:
-    """Points (n, 3) of a projected or local CRS in {Main}."""
-    if isinstance(origin, Corner):
-        moved: NDArray[np.float64] = np.atleast_2d(np.asarray(xyz, dtype=float)) - np.array(origin)
-        return moved
-    return wgs84_to_main(to_wgs84(xyz, crs), origin)

@@ -12,7 +12,8 @@ import shapely
 from pyproj import CRS
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, project
+from vinemap.geo.crs import from_wgs84, project
+from vinemap.geo.main import Origin, main_to_wgs84
 from vinemap.odometry.poses import Pose, onward
 from vinemap.odometry.track import stretches
 from vinemap.product.layers import REAL, TEXT, TIME, WHOLE, Layer

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.geo.boundaries import Boundary
-    from vinemap.geo.crs import Origin
     from vinemap.geo.lines import KnownRows
+    from vinemap.geo.main import Origin
 
 SETTLED = 2.0
 """Seconds within which a file can change twice without its time telling."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.geo.crs import Corner, Origin
+    from vinemap.geo.main import Corner, Origin
     from vinemap.geo.raster import Raster
     from vinemap.product.recipe import Recipe
 

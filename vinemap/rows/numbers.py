@@ -8,7 +8,8 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.geo.crs import WGS84, Corner, Origin, is_local, to_main, to_wgs84
+from vinemap.geo.crs import WGS84, is_local, to_wgs84
+from vinemap.geo.main import Corner, Origin, to_main
 from vinemap.rows.ends import UNSEEN, USUAL
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ import shapely
 from scipy.interpolate import PchipInterpolator
 
 from vinemap import paths
-from vinemap.geo.crs import Origin, from_wgs84, main_to_wgs84, parse_crs
+from vinemap.geo.crs import from_wgs84, parse_crs
+from vinemap.geo.main import Origin, main_to_wgs84
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
 from vinemap.simulate.survey import Survey, simulate
