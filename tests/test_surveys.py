@@ -155,6 +155,23 @@ def test_all_rows_and_no_other(product, shared, name, n):
 
 
 @pytest.mark.parametrize("name", ["parcelF", "twoblocks", "riseholme"])
+def test_vines_one_by_one(product, shared, name):
+    truth = shared / "surveys" / name / "truth.gpkg"
+    planted = gpd.read_file(truth, layer="rows")["n_vines"].sum()
+    dead = shapely.force_2d(gpd.read_file(truth, layer="dead_vines").geometry.to_numpy())
+    vines = gpd.read_file(paths.geopackage(product(name), name), layer="vines")
+    missing = shapely.force_2d(vines.geometry[vines["state"] == "missing"].to_numpy())
+    apart = shapely.distance(missing[:, None], dead)
+    spacing = rows_of(product(name), name)["length_m"].sum() / planted
+    assert abs(len(vines) - planted) <= 0.02 * planted
+    assert np.mean(apart.min(axis=0) < 0.3 * spacing) >= 0.97
+    assert np.mean(apart.min(axis=1) < 0.3 * spacing) >= 0.97
+    assert vines.groupby("row_id")["volume_m3"].sum().to_numpy() == pytest.approx(
+        rows_of(product(name), name)["volume_m3"].to_numpy(), rel=0.01
+    )
+
+
+@pytest.mark.parametrize("name", ["parcelF", "twoblocks", "riseholme"])
 def test_of_trees_and_a_hut_beside_the_rows_none_is_taken_for_vines(product, name):
     folder = product(name)
     unmapped = gpd.read_file(paths.geopackage(folder, name), layer="unmapped")

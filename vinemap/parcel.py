@@ -23,6 +23,7 @@ from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.unmapped import find_unmapped
+from vinemap.evaluate.vines import find_vines
 from vinemap.geo.crs import project
 from vinemap.geo.main import check_near, corner_of
 from vinemap.geo.raster import grid_over
@@ -71,7 +72,7 @@ BYTES_A_POINT = 60
 """Memory that a run takes: half of the machine's is for it."""
 
 STAGES: tuple[str, ...] = ("Reading", "DTM", "Canopy cover", "Row field", "Key points", "Clusters", "Curves")
-STAGES += ("Ends and gaps", "Sections", "Canopy", "Mesh", "Unmapped", "Writing")
+STAGES += ("Ends and gaps", "Sections", "Canopy", "Vines", "Mesh", "Unmapped", "Writing")
 
 
 def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
@@ -260,17 +261,19 @@ def follow(
         model, apart = model_canopies(found, settings, step=run), settings.sections.step
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
-        beyond = beyond_ends(rows, found.seen, polygon)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
+        given = settings.missing.model_dump() | {"step": apart}
+        rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, model.table, found.cover, **given)
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
         outlines = parcel_layer(parcel, rows, polygon, points)
         around = outlines if polygon else None
         layers = {
             "rows": rows,
-            "row_ends": ends.assign(beyond=beyond),
+            "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
             "key_points": enhanced,
             "sections": labelled(model.table, rows),
-            "gaps": labelled(found.gaps, rows),
+            "gaps": labelled(gaps, rows),
+            "vines": labelled(vines, rows),
             "unmapped": run("Unmapped", find_unmapped, found.chm, rows, around, tallest=settings.cover.high),
             "parcel": outlines,
         }

@@ -68,7 +68,7 @@ def exported(product, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     line, table = export_products([product], out, formats=FORMATS, lines="both")
     assert line.startswith(f"{NAME}: 7 rows, 5 lanes → ")
-    assert table.startswith("table: 7 lines of rows (csv")
+    assert table.startswith("table: 7 lines of rows, 0 lines of vines (csv")
     return out / NAME
 
 

@@ -25,6 +25,7 @@ CONTRACT = {
         "trv_m3_ha lwa_m2_ha good under over reduction quality"
     ).split(),
     "gaps": "row_id label start_m end_m length_m n_missing state".split(),
+    "vines": "row_id label number position_m state height_m width_m volume_m3 position_sd_m".split(),
     "unmapped": "reason area_m2 share height_m width_m".split(),
     "parcel": (
         "parcel n_rows rows_length_m area_m2 spacing_m orientation_deg gap_m n_missing vine_spacing_m vertical_datum "
@@ -37,6 +38,7 @@ GEOMETRY = {
     "key_points": "Point Z",
     "sections": "LineString Z",
     "gaps": "LineString Z",
+    "vines": "Point Z",
     "unmapped": "MultiPolygon",
     "parcel": "MultiPolygon",
 }

@@ -39,7 +39,7 @@ def test_it_is_the_same_each_time(products):
 
 def test_every_source_is_a_file_beside_it(products, document):
     sources = [layer.findtext("datasource") for layer in document.iter("maplayer")]
-    assert len(sources) == 13
+    assert len(sources) == 14
     for source in sources:
         assert source.startswith("./")
         assert (products[0] / source.partition("|")[0]).is_file()
@@ -49,7 +49,7 @@ def test_the_tree_has_every_layer_once_lines_above_rasters(document):
     leaves = [leaf.get("id") for leaf in document.find("layer-tree-group").iter("layer-tree-layer")]
     kinds = {layer.findtext("id"): layer.get("type") for layer in document.iter("maplayer")}
     assert sorted(leaves) == sorted(kinds)
-    assert [kinds[leaf] for leaf in leaves] == ["vector"] * 7 + ["raster"] * 6
+    assert [kinds[leaf] for leaf in leaves] == ["vector"] * 8 + ["raster"] * 6
     assert all(len(leaf) > 10 for leaf in leaves)
 
 

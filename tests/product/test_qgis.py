@@ -75,7 +75,7 @@ def project(open_in_qgis, product):
 
 
 def test_the_bare_geopackage_is_styled(layers):
-    assert set(layers) == {"rows", "row_ends", "key_points", "sections", "gaps", "unmapped", "parcel"}
+    assert set(layers) == {"rows", "row_ends", "key_points", "sections", "gaps", "vines", "unmapped", "parcel"}
     assert all(layer["valid"] and layer["styled"] and layer["crs"] for layer in layers.values())
     assert layers["rows"]["labels"]
     assert layers["rows"]["renderer"] == layers["sections"]["renderer"] == "graduatedSymbol"
@@ -84,7 +84,9 @@ def test_the_bare_geopackage_is_styled(layers):
     assert layers["gaps"]["classes"] == [{"label": "missing", "colour": "#d7263d"}]
     assert layers["unmapped"]["renderer"] == "categorizedSymbol"
     assert layers["unmapped"]["classes"][-1] == {"label": "too tall", "colour": "#566a8c"}
-    assert layers["sections"]["scale"] == 800
+    assert layers["vines"]["renderer"] == "categorizedSymbol"
+    assert layers["vines"]["classes"][0] == {"label": "vine", "colour": "#1d2b24"}
+    assert layers["sections"]["scale"] == layers["vines"]["scale"] == 800
 
 
 def test_the_bare_geopackage_explains_itself(layers):
@@ -99,7 +101,7 @@ def test_the_project_opens_at_the_parcel_with_everything_valid(project):
     assert project["read"]
     assert project["title"] == "Clos & Fils #3"
     assert project["crs"] == "EPSG:32632"
-    assert len(project["layers"]) == 13
+    assert len(project["layers"]) == 14
     assert all(layer["valid"] and layer["crs"] for layer in project["layers"])
     assert project["errors"] == []
     assert project["colours"] > 200

@@ -205,11 +205,11 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     names = ["height_m", "width_m", "bottom_m", "trv_m3_ha", "lwa_m2_ha"]
     means = groups[names].mean().reindex(rows["row_id"])
     row = sections["row_id"].to_numpy()
-    volume = (sections["area_m2"] * _lengths(sections, step)).groupby(row).sum().reindex(rows["row_id"])
+    volume = (sections["area_m2"] * lengths_of(sections, step)).groupby(row).sum().reindex(rows["row_id"])
     return rows.assign(**{name: means[name].to_numpy() for name in names}, volume_m3=volume.to_numpy())
 
 
-def _lengths(sections: gpd.GeoDataFrame, step: float) -> Values:
+def lengths_of(sections: gpd.GeoDataFrame, step: float) -> Values:
     """Metres of row (m,) for which each section stands."""
     position, row = sections["position_m"].to_numpy(), sections["row_id"].to_numpy()
     away = np.diff(position)
@@ -244,7 +244,7 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     canopy = np.maximum(shapely.length(rows.geometry.to_numpy()) - gaps.sum(axis=1), step)
     table = pd.DataFrame(
         {
-            "modelled": pd.Series(_lengths(sections, step)).groupby(row).sum(),
+            "modelled": pd.Series(lengths_of(sections, step)).groupby(row).sum(),
             "seen": sections.groupby("row_id")["seen"].mean(),
             "difference": _difference(sections, step=step),
         }

@@ -63,6 +63,13 @@ LAYERS: dict[str, Layer] = {
         _ROW | dict.fromkeys(("start_m", "end_m", "length_m"), REAL) | {"n_missing": WHOLE, "state": TEXT},
         "Stretches of rows without canopy, or that were not seen",
     ),
+    "vines": Layer(
+        "Point Z",
+        _ROW
+        | {"number": WHOLE, "position_m": REAL, "state": TEXT}
+        | dict.fromkeys(("height_m", "width_m", "volume_m3", "position_sd_m"), REAL),
+        "Vines one by one, missing ones among them; none where nothing tells their spacing",
+    ),
     "unmapped": Layer(
         "MultiPolygon",
         {"reason": TEXT} | dict.fromkeys(("area_m2", "share", "height_m", "width_m"), REAL),

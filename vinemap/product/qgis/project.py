@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 MARGIN = 0.06
 """Share of the parcel's size that the map shows about it."""
-GEOMETRY = {"parcel": "Polygon", "unmapped": "Polygon", "row_ends": "Point", "key_points": "Point"}
+GEOMETRY = {"parcel": "Polygon", "unmapped": "Polygon", "row_ends": "Point", "key_points": "Point", "vines": "Point"}
 LEGEND = ("rows", "gaps", "unmapped", "parcel", "chm")
 
 
@@ -47,6 +47,7 @@ TREE: dict[str, list[Entry]] = {
         Entry("unmapped", "In no row"),
     ],
     "Details": [
+        Entry("vines", "Vines (zoom in)"),
         Entry("key_points", "Key points (zoom in)", shown=False),
         Entry("sections", "Sections: canopy height (zoom in)"),
     ],

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
+from vinemap.evaluate.vines import VINE, WEAK
 from vinemap.product.qgis.symbology import (
     by_value,
     categorised,
@@ -45,8 +46,10 @@ WORDS = {
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
     "unseen_m": "Length that was not seen (m)",
-    "state": "Vines missing, or not seen",
+    "state": "State: what stands there",
     "beyond": "What is beyond that end",
+    "number": "Number from e1",
+    "position_sd_m": "Standard deviation of the position (m)",
     "share": "Share of the parcel",
     "rows_length_m": "Length of all rows (m)",
     "bottom_m": "Bottom of the foliage (m)",
@@ -83,6 +86,9 @@ DIRECTIONS = ("#e0558d", "#e88a3c", "#b3b43a", "#4bb56b", "#3aa7c4", "#7377d9", 
 CANOPY = ("#ccd9bf", "#ccd9bf", "#a9c19b", "#84a67c", "#5f8a61", "#3c6a4b")
 REASONS = {UNSEEN: "#c2185b", ALONE: "#ef6fa5", LOW: "#f0a202", WIDE: "#96582a", TALL: "#566a8c"}
 """Colours of what is in no row, by the reason."""
+VINES = {VINE: INK, WEAK: "#f0a202", MISSING: RED, NOT_SEEN: GREY}
+"""Colours of vines, by what stands in their places."""
+CATEGORIES = {"unmapped": ("reason", REASONS), "vines": ("state", VINES)}
 LOWEST_CANOPY, HIGHEST_CANOPY = 0.5, 2.5
 """Metres between which the canopies' height has its colours, the same in all parcels and surveys."""
 
@@ -96,6 +102,7 @@ SYMBOLS = {
     "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
     "track": ("line", [CASING | {"line_color": rgba(PAPER)}, {"line_color": rgba(TRACK), "line_width": "0.7"}]),
     "poses": ("marker", [{"outline_style": "no", "size": "1.3"}]),
+    "vines": ("marker", [{"outline_width": "0.3", "size": "1.5"}]),
     "unmapped": ("fill", [{"outline_width": "0.4"}]),
     "parcel": (
         "fill",
@@ -105,7 +112,7 @@ SYMBOLS = {
 GAPS = {MISSING: {"line_color": rgba(RED)}, NOT_SEEN: {"line_color": rgba(GREY)}}
 FLAGGED = "if(\"flag\" = '', 0, 1)"
 MEASURED_OR_NOT = [(-0.5, 0.5, "measured", TRACK), (0.5, 1.5, "flagged", RED)]
-SMALLEST_SCALE = {"sections": 800, "key_points": 1500, "row_ends": 4000, "poses": 500}
+SMALLEST_SCALE = {"sections": 800, "vines": 800, "key_points": 1500, "row_ends": 4000, "poses": 500}
 """Layers of small things show from this scale denominator on."""
 LABEL_SCALE = 4000
 MAP_TIPS = {
@@ -116,6 +123,9 @@ MAP_TIPS = {
     "round(canopy_confidence, 2) || ' in its canopy') %][% if(flags = '', '', '<br>' || flags) %]",
     "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, "
     "[% if(state = 'unseen', 'not seen', 'missing vines: ' || n_missing) %]",
+    "vines": "<b>Row [% label %], [% number %]</b> at [% round(position_m, 1) %] m<br>[% state %]"
+    "[% if(height_m is null, '', '<br>' || round(height_m, 2) || ' m high, ' || round(width_m, 2) || ' m wide, ' || "
+    "round(volume_m3, 2) || ' m³') %]",
     "sections": "<b>Row [% label %]</b> at [% round(position_m, 1) %] m<br>[% round(height_m, 2) %] m high, "
     "[% round(width_m, 2) %] m wide",
     "row_ends": "<b>Row [% label %]</b>, end [% end %][% if(beyond = 'seen', '', '<br>it may go on: ' || beyond) %]",
@@ -187,9 +197,10 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
         renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
     elif layer == "sections":
         renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
-    elif layer == "unmapped":
-        there = {reason: shade for reason, shade in REASONS.items() if (table["reason"] == reason).any()}
-        renderer = categorised("reason", there or REASONS, symbol)
+    elif layer in CATEGORIES:
+        column, colours = CATEGORIES[layer]
+        there = {value: shade for value, shade in colours.items() if (table[column] == value).any()}
+        renderer = categorised(column, there or colours, symbol)
     elif layer == "gaps":
         states = {state: own for state, own in GAPS.items() if state == MISSING or (table["state"] == state).any()}
         renderer = by_value("state", states, symbol)

@@ -1,0 +1,179 @@
+"""Vines one by one: on cover that is drawn of vines whose places are known, and on a simulated survey."""
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+
+from vinemap.canopy.numbers import lengths_of, summarise_rows
+from vinemap.evaluate.planting import Edges, estimate_spacing
+from vinemap.evaluate.vines import find_vines
+from vinemap.geo.raster import Raster, grid_over
+from vinemap.parcel import map_rows, model_canopies
+
+STEP = 0.25
+ROWS_APART = 2.5
+
+
+def planted(spacing, *, extent=None, length=40.0, rows=8, dead=0.08, seed=0, block=1, south=0.0):
+    """Rows from west to east and, of each, places of vines and which are dead; the first and the last never are."""
+    rng = np.random.default_rng(seed)
+    extent = spacing if extent is None else extent
+    out = []
+    for k in range(rows):
+        n = round((length + rng.uniform(-2, 2) - extent) / spacing) + 1
+        place = extent / 2 + np.arange(n) * spacing
+        gone = rng.random(n) < dead
+        gone[[0, -1]] = False
+        out.append((south + k * ROWS_APART, place, gone, extent, block))
+    return out
+
+
+def tables(rows, *, unseen=()):
+    """Rows, gaps, sections and cover of them; of vines ``unseen``, by row and number, nothing is there."""
+    cover = np.zeros((round((max(r[0] for r in rows) + 3) / 0.1), 500), dtype=np.float32)
+    grid = grid_over([0, -1.5], [50, 0.1 * len(cover) - 1.5], resolution=0.1)
+    cover = np.zeros(grid.shape, dtype=np.float32)
+    x, y = grid.centres()
+    lines, gaps, sections = [], [], []
+    for i, (north, place, gone, extent, block) in enumerate(rows, 1):
+        hidden = np.isin(np.arange(len(place)), [k - 1 for row, k in unseen if row == i])
+        there = place[~gone & ~hidden]
+        length = place[-1] + extent / 2
+        lines.append((i, block, 0.5, 0, 1.0, shapely.LineString([[2, north, 100], [2 + length, north, 110]])))
+        canopy = np.abs(x[None, :] - 2 - there[:, None]).min(axis=0) <= extent / 2
+        cover[np.ix_(np.abs(y - north) <= 0.25, canopy)] = 0.8
+        stations = np.arange(STEP / 2, length, STEP)
+        stations = stations[np.abs(stations[:, None] - there).min(axis=1) <= extent / 2]
+        sections += [(i, s, 1.8, 0.5, 0.7, 80) for s in stations]
+        edges = np.column_stack([there[:-1] + extent / 2, there[1:] - extent / 2])
+        for a, b in edges[np.diff(edges, axis=1)[:, 0] > 0.8]:
+            dark = ((place[hidden] > a) & (place[hidden] < b)).any()
+            gaps.append((i, a, b, b - a, 1, "unseen" if dark else "missing"))
+    columns = ["row_id", "block", "width_m", "n_missing", "vine_spacing_m", "geometry"]
+    return (
+        gpd.GeoDataFrame(pd.DataFrame(lines, columns=columns), crs=32632),
+        gpd.GeoDataFrame(pd.DataFrame(gaps, columns=["row_id", "start_m", "end_m", "length_m", "n_missing", "state"])),
+        pd.DataFrame(sections, columns=["row_id", "position_m", "height_m", "width_m", "area_m2", "n_points"]),
+        Raster(cover, grid, None),
+    )
+
+
+def compared(vines, rows, *, within):
+    """Whether vines are as they were planted, in number, state and, but for what is given in metres, place."""
+    for i, (_, place, gone, *_) in enumerate(rows, 1):
+        own = vines[vines["row_id"] == i]
+        np.testing.assert_array_equal(own["number"], np.arange(1, len(place) + 1))
+        np.testing.assert_array_equal(own["state"] == "missing", gone)
+        assert np.abs(own["position_m"].to_numpy() - place).max() < within
+
+
+@pytest.mark.parametrize(("spacing", "extent"), [(0.9, None), (1.3, None), (1.0, 1.1), (2.1, 1.0), (1.6, 0.5)])
+def test_vines_stand_where_gaps_tell(spacing, extent):
+    rows = planted(spacing, extent=extent)
+    out, gaps, vines = find_vines(*tables(rows))
+    assert out["vine_spacing_m"].unique() == pytest.approx([spacing], rel=0.01)
+    compared(vines, rows, within=0.15 * spacing)
+    assert (vines["position_sd_m"] < 0.3 * spacing).all()
+    assert out["n_missing"].tolist() == [gone.sum() for _, _, gone, *_ in rows]
+    assert gaps["n_missing"].sum() == out["n_missing"].sum()
+
+
+def test_vines_lie_on_their_rows():
+    rows = planted(1.2)
+    out, _, vines = find_vines(*tables(rows))
+    lines = out.set_index("row_id").geometry[vines["row_id"]].to_numpy()
+    assert shapely.distance(lines, vines.geometry.to_numpy()).max() < 1e-6
+    share = vines["position_m"] / shapely.length(shapely.force_2d(lines))
+    np.testing.assert_allclose(shapely.get_z(vines.geometry.to_numpy()), 100 + 10 * share)
+
+
+def test_hedges_without_gaps_have_so_many_vines_anywhere():
+    rows = planted(1.1, dead=0)
+    told = tables(rows)
+    out, _, vines = find_vines(*told, vine_spacing=1.1)
+    assert vines.groupby("row_id").size().tolist() == [len(place) for _, place, *_ in rows]
+    np.testing.assert_allclose(vines["position_sd_m"], 1.1 / 12**0.5, rtol=0.02)
+    assert not out["n_missing"].any()
+
+
+def test_nothing_is_made_up_where_no_spacing_is_told():
+    told = tables(planted(1.1, dead=0))
+    out, _, vines = find_vines(*told)
+    assert len(vines) == 0
+    assert list(vines.columns[:3]) == ["row_id", "number", "position_m"]
+    pd.testing.assert_frame_equal(pd.DataFrame(out), pd.DataFrame(told[0]))
+
+
+def test_gaps_without_any_order_tell_no_spacing():
+    rng, told = np.random.default_rng(5), 0
+    for _ in range(40):
+        rows = []
+        for _ in range(8):
+            starts = np.sort(rng.uniform(2, 38, 5))
+            rows.append(Edges(40.0, np.append(starts, 40.0), np.append(starts + rng.uniform(0.5, 1.5, 5), 0.0)))
+        told += estimate_spacing(rows) is not None
+    assert told <= 1
+
+
+def test_blocks_have_their_own_spacing_and_lend_it_to_those_without():
+    rows = planted(0.9, rows=6) + planted(1.5, rows=6, block=2, south=20, seed=1)
+    rows += planted(0.9, rows=2, block=3, south=40, seed=2, dead=0)
+    out, _, vines = find_vines(*tables(rows))
+    spacing = out.groupby("block")["vine_spacing_m"].first()
+    assert spacing[[1, 2]].tolist() == pytest.approx([0.9, 1.5], rel=0.01)
+    assert (vines.groupby("row_id").size().reindex(out["row_id"]) > 0).all()
+    compared(vines[vines["row_id"] <= 12], rows[:12], within=0.2)
+
+
+def test_what_was_not_seen_is_not_missing():
+    rows = planted(1.2)
+    unseen = [(3, k) for k in range(10, 16)]
+    for _, k in unseen:
+        rows[2][2][k - 1] = False
+    rows[2][2][[8, 15]] = False
+    out, _, vines = find_vines(*tables(rows, unseen=unseen))
+    own = vines[vines["row_id"] == 3]
+    assert own.loc[own["state"] == "unseen", "number"].tolist() == [k for _, k in unseen]
+    assert own.loc[own["state"] == "unseen", ["height_m", "width_m", "volume_m3"]].isna().all(axis=None)
+    assert out["n_missing"].tolist() == [gone.sum() for _, _, gone, *_ in rows]
+
+
+def test_canopies_of_vines_add_up_to_their_rows_and_weak_ones_are_told():
+    rows = planted(1.2)
+    told = tables(rows)
+    sections = told[2]
+    first = (sections["row_id"] == 2) & sections["position_m"].between(1.2, 2.4)
+    sections.loc[first, "area_m2"] *= 0.3
+    sections.loc[first, "height_m"] = 1.0
+    out, _, vines = find_vines(*told)
+    total = (sections["area_m2"] * lengths_of(sections, STEP)).groupby(sections["row_id"]).sum()
+    np.testing.assert_allclose(vines.groupby("row_id")["volume_m3"].sum(), total)
+    weak = vines[vines["state"] == "weak"]
+    assert weak[["row_id", "number"]].to_numpy().tolist() == [[2, 2]]
+    assert weak["height_m"].iloc[0] == pytest.approx(1.0, abs=0.25)
+    gone = vines[vines["state"] == "missing"]
+    assert (gone["volume_m3"] == 0).all()
+    assert gone["height_m"].isna().all()
+    assert out["n_missing"].sum() == len(gone)
+
+
+def test_a_parcel_without_rows_has_no_vines():
+    rows, gaps, sections, cover = tables(planted(1.2))
+    out, no_gaps, vines = find_vines(rows[:0], gaps[:0], sections[:0], cover)
+    assert len(out) == len(no_gaps) == len(vines) == 0
+
+
+def test_vines_of_a_survey(vineyard, cloud):
+    found = map_rows(cloud)
+    sections = model_canopies(found).table
+    rows = summarise_rows(found.rows, sections, step=STEP)
+    _, _, vines = find_vines(rows, found.gaps, sections, found.cover)
+    truth = vineyard.rows["n_vines"].sum()
+    assert abs(len(vines) - truth) <= 0.02 * truth
+    gone = vines[vines["state"] == "missing"].geometry.to_numpy()
+    dead = vineyard.dead_vines.geometry.to_numpy()
+    apart = shapely.distance(shapely.force_2d(gone)[:, None], shapely.force_2d(dead))
+    assert len(gone) == len(dead)
+    assert apart.min(axis=0).max() < 0.3 * 0.9
