@@ -37,7 +37,7 @@ ROOMS = [
 """From the ground up: a module may import its own room and those above it in this list, never those below."""
 STAGES = {
     "surfaces": {"ground", "canopy_height", "cover"},
-    "rows": {"field", "key_points", "clusters", "curves", "known", "fit", "blocks", "confidence", "numbers"},
+    "rows": {"field", "key_points", "clusters", "curves", "known", "fit", "blocks", "numbers"},
     "canopy": {"sections", "foliage", "feet", "growth", "cgon", "numbers", "mesh", "classification"},
 }
 """Steps of the chain: what two of them need lies in a file of its own."""

@@ -22,6 +22,7 @@ from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
+from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.crs import project
@@ -36,7 +37,6 @@ from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
 from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.clusters import cluster_rows
-from vinemap.rows.confidence import believed, judge_rows
 from vinemap.rows.curves import trace_rows
 from vinemap.rows.ends import beyond_ends
 from vinemap.rows.field import estimate_row_field, refine_row_field

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import shapely
 
+from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.blocks import flag_rows, group_blocks
-from vinemap.rows.confidence import believed, judge_rows
 from vinemap.surfaces.seen import Seen
 
 SPACING = 2.5
