@@ -3,6 +3,7 @@
 import geopandas as gpd
 import numpy as np
 import pytest
+from pyproj import CRS
 from scipy.sparse.csgraph import connected_components
 
 from vinemap.geo.raster import Raster, grid_over
@@ -158,25 +159,64 @@ def test_rows_that_touch_where_blocks_abut_are_torn():
     assert_rows_are_kept_apart(cluster_rows(key_points(kinked, spacing=2)), 10)
 
 
+def spots(places):
+    """Cover of posts, or weeds."""
+    grid = grid_over([-2, -2], [47, 30], resolution=0.1)
+    x, y = np.meshgrid(*grid.centres())
+    values = np.zeros(grid.shape)
+    for px, py in places:
+        values[np.hypot(x - px, y - py) < 0.15] = 0.6
+    return Raster(values, grid, CRS.from_epsg(32632))
+
+
 def test_posts_tell_a_gap_of_all_rows_from_a_track():
     """All ten rows lack 5 m; posts stand there in some of them, or weeds anywhere."""
     rows = [np.array([[0, 2.5 * k], [40, 2.5 * k]]) for k in range(10)]
     points = key_points(rows)
     points = points[~points.geometry.x.between(17, 22)].reset_index(drop=True)
-    grid = grid_over([-2, -2], [42, 25], resolution=0.1)
-    x, y = np.meshgrid(*grid.centres())
-
-    def spots(places):
-        values = np.zeros(grid.shape)
-        for px, py in places:
-            values[np.hypot(x - px, y - py) < 0.15] = 0.6
-        return Raster(values, grid, points.crs)
-
     posts = spots([(19.3, 2.5), (19.6, 12.5), (19.5, 20.0)])
     assert_rows_are_kept_apart(cluster_rows(points, posts), 10)
     weeds = spots([(19.3, 2.5), (19.3, 3.6), (19.6, 12.5), (19.5, 11.4)])
     assert cluster_rows(points, weeds)["cluster"].nunique() == 20
     assert cluster_rows(points)["cluster"].nunique() == 20
+
+
+@pytest.mark.parametrize("aside", [12.5, 13.7])
+def test_rows_end_at_a_track_though_something_stands_on_it(aside):
+    """A car on a track of 5 m through fourteen rows, in line with one of them or between two."""
+    rows = [np.array([[a, 2.5 * k], [b, 2.5 * k]]) for k in range(14) for a, b in ((0, 30), (35, 60))]
+    found = cluster_rows(key_points([*rows, np.array([[31, aside], [34, aside]])]))
+    pieces = found[found["truth"] < 28].groupby("truth")["cluster"].agg(set)
+    whole = [west == east for west, east in zip(pieces[::2], pieces[1::2], strict=True)]
+    assert sum(whole) <= (aside == 12.5)
+
+
+def test_rows_end_at_a_track_that_ends_at_a_road():
+    """Beyond the road other rows go on where the track would."""
+    rows = [np.array([[a, 2.5 * k], [b, 2.5 * k]]) for k in range(12) for a, b in ((0, 30), (35, 60))]
+    beyond = [np.array([[0, 32.0 + 2.5 * k], [60, 32.0 + 2.5 * k]]) for k in range(8)]
+    assert_rows_are_kept_apart(cluster_rows(key_points([*rows, *beyond])), 32)
+
+
+@pytest.mark.parametrize("first", [4, 12])
+def test_a_bare_strip_that_ends_within_a_field_is_no_track(first):
+    """All rows from one on to the last lack 5 m."""
+    points = key_points([np.array([[0, 2.5 * k], [60, 2.5 * k]]) for k in range(24)])
+    gap = (points["truth"] >= first) & points.geometry.x.between(30, 35)
+    assert_rows_are_kept_apart(cluster_rows(points[~gap].reset_index(drop=True)), 24)
+
+
+def test_last_posts_of_rows_are_none_that_go_on():
+    """At a track of 5 m some rows lack their last vines, so that their end posts stand in a gap that is longer."""
+    rng = np.random.default_rng(4)
+    lacking = np.where(rng.random((12, 2)) < 0.5, rng.uniform(1.5, 5, (12, 2)), 0)
+    ends = [((0, 20 - before), (25 + after, 45)) for before, after in lacking]
+    rows = [np.array([[a, 2.5 * k], [b, 2.5 * k]]) for k, both in enumerate(ends) for a, b in both]
+    posts = spots([(x, 2.5 * k) for k, lack in enumerate(lacking) for x in np.array([20.3, 24.7])[lack > 0]])
+    points = key_points(rows)
+    assert_rows_are_kept_apart(cluster_rows(points, posts), 24)
+    going_on = spots([(x, 2.5 * k) for k in range(12) for x in (18.0, 22.5, 27.0)])
+    assert cluster_rows(points, going_on)["cluster"].nunique() == 12
 
 
 def test_straight_rows_are_not_joined_by_a_bend():

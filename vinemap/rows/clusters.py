@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.rows.joins import candidates, ends_of, join, over_track_or_headland, torn, with_posts
+from vinemap.rows.joins import candidates, ends_of, join, torn
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -78,12 +78,8 @@ def cluster_rows(
     position = _position_along(np.flatnonzero(kept), pieces, graph)
     pieces, position = torn(xy[kept], spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
-    pairs = candidates(ends, max_gap)
-    over = over_track_or_headland(ends, pairs, xy[kept], track_width)
-    if cover is not None:
-        over[over] = ~with_posts(ends, pairs[over], cover)
-    pairs = pairs[~over]
-    return out.assign(cluster=join(pairs, len(ends.spacing))[pieces])
+    rows = join(ends, candidates(ends, max_gap), xy[kept], track_width=track_width, cover=cover)
+    return out.assign(cluster=rows[pieces])
 
 
 def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values, mutual: bool = False) -> csr_array:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import label, maximum_filter1d
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from vinemap.geo.raster import sample_across
+from vinemap.rows.tracks import gaps_between, on_tracks, parts_of
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -24,25 +24,10 @@ THEREABOUTS, SEVERAL = 25.0, 5
 """Metres within which pieces, and so many of them, tell how rows bend."""
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
-FLANK = 4.0
-"""Metres before and after a gap in which the rows stand that must end there for it to be a track."""
-ACROSS = 6
-"""Rows on each side of a gap that are looked at for a track."""
-MOST = 0.8
-"""Share of those rows that end there at a track."""
-OPEN = 0.62
-"""Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
 STRIDE = 0.5
 """Metres between the places at which ground is looked at."""
 BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
 """Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
-MARGIN = 0.5
-"""Spacings by which a row must be crossed."""
-POST, THICK, SPOTS, CLEAR = 0.25, 0.6, 0.15, 1.2
-"""Cover of a post between two rows' ends, metres that one takes at the most, share of the way that several do, and
-metres from an end within which one is the row's last."""
-POSTED = 0.25
-"""Share of the gaps side by side with posts in them from which it is no track."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -144,73 +129,22 @@ def candidates(ends: Ends, max_gap: float) -> Ints:
     return out
 
 
-def over_track_or_headland(ends: Ends, pairs: Ints, xy: Values, track_width: float) -> Flags:
-    """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
+def join(ends: Ends, pairs: Ints, xy: Values, *, track_width: float, cover: Raster | None = None) -> Ints:
+    """Row (m,) of each piece of key points (n, 2): ends are paired in the order of ``pairs`` (k, 2), but over no track.
 
-    What lies farther than half a track from all key points is open ground. The gap lies on a track if the open ground
-    about its middle goes on across ``MOST`` of the rows that stand beside its ends, up to ``ACROSS`` on each side:
-    missing vines of some neighbours may line up, those of all don't, but something may stand at a track's side.
+    Each end is paired once.
     """
-    tree = cKDTree(xy)
-    out = np.zeros(len(pairs), dtype=bool)
+    rows = np.arange(len(ends.spacing) // 2)
+    taken, chosen = np.zeros(len(ends.spacing), dtype=bool), np.zeros(len(pairs), dtype=bool)
     for k, (a, b) in enumerate(pairs):
-        gap = ends.xy[b] - ends.xy[a]
-        length = float(np.hypot(*gap))
-        if length < track_width:
-            continue
-        spacing = float(ends.spacing[[a, b]].mean())
-        middle, along = (ends.xy[a] + ends.xy[b]) / 2, gap / length
-        around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
-        near = xy[tree.query_ball_point(middle, around)] - middle
-        x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
-        beside = (np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)
-        standing = np.unique(np.rint(y[beside]).astype(int))
-        sides = [side[(side >= 1) & (side <= ACROSS)] for side in (standing, -standing)]
-        if sum(map(len, sides)) > 1:
-            open_to = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))
-            crossed = sum(np.count_nonzero(side <= far) for side, far in zip(sides, open_to, strict=True))
-            out[k] = crossed >= MOST * sum(map(len, sides))
-    return out
-
-
-def with_posts(ends: Ends, pairs: Ints, cover: Raster) -> Flags:
-    """Whether posts stand in a gap between two ends (k, 2), or in several beside it: there rows go on without vines.
-
-    A post is a spot of canopy in line with the ends, with less half a spacing beside them.
-    """
-    a, b = ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]]
-    spacing = ends.spacing[pairs].mean(axis=1)
-    length = np.hypot(*(b - a).T)
-    step = cover.grid.resolution
-    own = np.zeros(len(pairs), dtype=bool)
-    for k in np.flatnonzero(length > 2 * CLEAR + STRIDE):
-        along = (b[k] - a[k]) / length[k]
-        line = a[k] + np.arange(CLEAR, length[k] - CLEAR, step)[:, None] * along
-        offsets = np.concatenate([np.linspace(-0.1, 0.1, 3), np.linspace(-0.5, -0.3, 3), np.linspace(0.3, 0.5, 3)])
-        normal = np.broadcast_to([-along[1], along[0]], line.shape)
-        seen = sample_across(cover, line, normal, offsets * spacing[k])
-        on, beside = seen[:, :3].max(axis=1), seen[:, 3:].max()
-        thick = np.count_nonzero(on > POST / 2) * step
-        own[k] = on.max() > max(POST, 2 * beside) and thick < max(THICK, SPOTS * length[k])
-    out = own.copy()
-    middle = (a + b) / 2
-    for k in np.flatnonzero(~own):
-        beside = np.hypot(*(middle - middle[k]).T) <= ACROSS * spacing[k]
-        out[k] = np.count_nonzero(own[beside]) >= max(2, POSTED * np.count_nonzero(beside))
-    return out
-
-
-def join(pairs: Ints, n_ends: int) -> Ints:
-    """Row (m,) of each piece: ends are paired in the order of ``pairs`` (k, 2), each end once."""
-    rows = np.arange(n_ends // 2)
-    taken = np.zeros(n_ends, dtype=bool)
-    for a, b in pairs:
         one, other = rows[a // 2], rows[b // 2]
         if not (taken[a] or taken[b] or one == other):
-            taken[[a, b]] = True
+            chosen[k] = taken[a] = taken[b] = True
             rows[rows == other] = one
-    out: Ints = np.unique(rows, return_inverse=True)[1]
-    return out
+    pairs = pairs[chosen]
+    gaps = gaps_between(ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]], ends.spacing[pairs].mean(axis=1))
+    one, other = (pairs[~on_tracks(gaps, xy, track_width=track_width, cover=cover)] // 2).T
+    return parts_of(len(rows), one, other)
 
 
 def _axis(cosine: float, sine: float) -> Values:
@@ -287,26 +221,3 @@ def _end_beside(tree: cKDTree, pieces: Ints, middle: Values, along: Values, spac
     before, after = (set(pieces[near[(way * x >= ASLANT) & (way * x <= STRETCH)]]) for way in (-1, 1))
     # The row itself goes on; a row that ends here and another that begins count as one.
     return len(before ^ after) > 2 * (len(before & after) - 1)
-
-
-def _open_across(
-    tree: cKDTree, middle: Values, along: Values, length: float, spacing: float, radius: float
-) -> tuple[float, float]:
-    """Rows to the left and to the right up to which the open ground about the middle of a gap goes on."""
-    cells = int(np.ceil((ACROSS + 1) * spacing / STRIDE))
-    across = np.arange(-cells, cells + 1) * STRIDE
-    reach = int(np.ceil((length / 2 + (ACROSS + 1) * spacing) / STRIDE))
-    on = np.arange(-reach, reach + 1) * STRIDE
-    # A track may run aslant, at 45° at the most.
-    inside = np.abs(on) <= length / 2 + np.abs(across)[:, None]
-    normal = np.array([-along[1], along[0]])
-    places = middle + on[None, :, None] * along + across[:, None, None] * normal
-    distance = tree.query(places[inside], distance_upper_bound=radius)[0]
-    free = np.zeros(inside.shape, dtype=bool)
-    free[inside] = np.isinf(distance)
-    ground = label(free)[0]
-    here = ground[cells - 1 : cells + 2, np.abs(on) <= max(length / 2 - radius, 0) + STRIDE]
-    mine = across[np.isin(ground, here[here > 0]).any(axis=1)]
-    left, right = (max(0.0, float(side.max(initial=0.0))) for side in (mine, -mine))
-    # Open ground keeps a radius from rows: the last that it crosses lies that much nearer.
-    return (left + radius) / spacing - MARGIN, (right + radius) / spacing - MARGIN

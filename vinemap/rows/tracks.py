@@ -1,0 +1,221 @@
+"""Tracks and headlands told from missing vines: the gaps of neighbouring rows are judged as one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from vinemap.geo.raster import sample_across
+
+if TYPE_CHECKING:
+    from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.geo.raster import Raster
+
+FLANK = 4.0
+"""Metres before and after a gap in which the rows stand that must end there for it to be a track."""
+ACROSS = 6
+"""Rows on each side of a gap that are looked at for a track."""
+MOST = 0.8
+"""Share of the rows that a track crosses, of those from where it comes into the field to where it leaves it."""
+APART = 1.2
+"""Spacings to the next row beyond which a field ends."""
+NEXT = 3.5
+"""Spacings within which gaps are side by side: in a row between them something may stand on a track."""
+COVERED, LONGER = 0.7, 3.0
+"""Share of a gap that another beside it has in common with it, and how much longer than it that may be, to be judged
+with it."""
+ASKEW = 3.0
+"""Metres by which a track at 45° to rows must be wider than one straight across them."""
+SLANTS = np.concatenate([[0.0], np.arange(-1, 1.01, 0.1)])[:, None]
+"""Tangents of the angle at which a track may cross rows."""
+OPEN = 0.62
+"""Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
+MARGIN = 0.5
+"""Spacings by which a row must be crossed."""
+POST, THICK, SPOTS, CLEAR = 0.25, 0.6, 0.15, 1.0
+"""Cover of a post between two rows' ends, metres that one takes at the most, share of the way that several do, and
+metres from an end within which one is the row's last."""
+LAST = 0.75
+"""Metres beside a track within which a row's last post stands, and ``CLEAR`` inside."""
+POSTED = 0.2
+"""Share of the gaps side by side with posts in them from which it is no track."""
+STRIDE = 0.5
+"""Metres between the places at which ground is looked at."""
+
+
+class Gaps(NamedTuple):
+    """Gaps between two ends."""
+
+    middle: Values
+    along: Values
+    """Unit vectors (k, 2)."""
+    length: Values
+    spacing: Values
+
+
+def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:
+    """Gaps between ends of rows a and b (k, 2)."""
+    length = np.hypot(*(b - a).T)
+    return Gaps((a + b) / 2, (b - a) / np.maximum(length, 1e-9)[:, None], length, spacing)
+
+
+def on_tracks(gaps: Gaps, xy: Values, *, track_width: float, cover: Raster | None = None) -> Flags:
+    """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
+
+    Gaps of neighbouring rows that lie side by side are judged as one. What lies farther than half a track from all key
+    points is open ground. They are a track if it leads out of the field on both sides of them and through ``MOST`` of
+    its rows, and if no posts stand in it: missing vines of some neighbours may line up, those of all don't, but
+    something may stand on a track.
+    """
+    wide = np.flatnonzero(gaps.length >= track_width)
+    out = np.zeros(len(gaps.length), dtype=bool)
+    if len(wide) == 0:
+        return out
+    gaps = Gaps(*(values[wide] for values in gaps))
+    tree = cKDTree(xy)
+    one, other, common = _side_by_side(gaps)
+    covers = common >= COVERED * gaps.length[other]
+    linked = covers & (gaps.length[one] <= LONGER * gaps.length[other])
+    lanes = parts_of(len(wide), one[linked], other[linked])
+    for k in range(lanes.max() + 1):
+        lane = np.union1d(np.flatnonzero(lanes == k), one[covers & (lanes[other] == k)])
+        if _leads_out(tree, gaps, lane, track_width):
+            posts = _with_posts(gaps, lane, cover) if cover is not None else 0
+            out[wide[lane]] |= posts < max(min(2, len(lane)), POSTED * len(lane))
+    return out
+
+
+def _side_by_side(gaps: Gaps) -> tuple[Ints, Ints, Values]:
+    """Gaps in rows beside each other, every pair in both orders, and how many metres they have in common."""
+    reach = np.hypot(NEXT * float(gaps.spacing.max()), float(gaps.length.max()) / 2)
+    pairs = cKDTree(gaps.middle).query_pairs(reach, output_type="ndarray")
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    x, y = _in_frame(gaps, one, other)
+    half, its = gaps.length[one] / 2, gaps.length[other] / 2
+    common = np.minimum(half, x + its) - np.maximum(-half, x - its)
+    parallel = np.abs((gaps.along[one] * gaps.along[other]).sum(axis=1)) > 0.9
+    beside = parallel & (common > 0) & (np.abs(y) > 0.5) & (np.abs(y) < NEXT)
+    return one[beside], other[beside], common[beside]
+
+
+def _in_frame(gaps: Gaps, one: Ints, other: Ints) -> tuple[Values, Values]:
+    """Middles of other gaps from those of some: metres along their rows, and spacings to the left."""
+    way, along = gaps.middle[other] - gaps.middle[one], gaps.along[one]
+    left = along[..., 0] * way[..., 1] - along[..., 1] * way[..., 0]
+    return (way * along).sum(axis=-1), left / gaps.spacing[one]
+
+
+def _leads_out(tree: cKDTree, gaps: Gaps, lane: Ints, track_width: float) -> bool:
+    """Whether open ground leads out of the field on both sides of gaps side by side, and through all but a few rows."""
+    first = np.broadcast_to(lane[0], len(lane))
+    y = _in_frame(gaps, first, lane)[1]
+    last = lane[[y.argmin(), y.argmax()]]
+    ways = (-1, 1) * np.where(gaps.along[last] @ gaps.along[lane[0]] < 0, -1, 1)
+    stopped, beyond = np.transpose(
+        [_beyond(tree, gaps, k, way, track_width) for k, way in zip(last, ways, strict=True)]
+    )
+    within = round(float(np.ptp(y)))
+    through = within + 1 - len(np.unique(np.rint(y - y.min())))
+    rows = beyond.sum() + within
+    return bool(rows > 1 and (stopped == 0).all() and through <= (1 - MOST) * rows)
+
+
+def _beyond(tree: cKDTree, gaps: Gaps, k: int, way: int, track_width: float) -> tuple[int, int]:
+    """Rows on one side of a gap, left (1) or right (-1), that stand where open ground doesn't lead, and all there."""
+    middle, along, length, spacing = gaps.middle[k], gaps.along[k], float(gaps.length[k]), float(gaps.spacing[k])
+    around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
+    near = tree.data[tree.query_ball_point(middle, around)] - middle
+    x, y = near @ along, way * (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
+    y = np.sort(y[(np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK) & (y > 0.5) & (y < ACROSS + 0.5)])
+    # The field ends at what is farther away than the next row.
+    rows = np.unique(np.rint(y[: np.append(np.diff(y, prepend=0) > APART, True).argmax()]))
+    if len(rows) == 0:
+        return 0, 0
+    far = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))[0 if way > 0 else 1]
+    return int(np.count_nonzero(rows > far)), len(rows)
+
+
+def _with_posts(gaps: Gaps, lane: Ints, cover: Raster) -> int:
+    """In how many of the gaps side by side posts stand that end no row.
+
+    Where the rows' last vines are missing, their last posts stand in a gap, but at the edge of what it has in common
+    with those thereabouts.
+    """
+    n = 0
+    for k in lane:
+        if not len(at := _posts(gaps, k, cover)):
+            continue
+        x, y = _in_frame(gaps, np.broadcast_to(k, len(lane)), lane)
+        near = np.abs(y) <= ACROSS
+        low, high = _corridor(x[near], y[near] * gaps.spacing[k], gaps.length[lane[near]] / 2)
+        sides = at - low, high - at
+        alone = any((side < -LAST).any() and not ((side >= -LAST) & (side <= CLEAR)).any() for side in sides)
+        n += bool(alone or (np.minimum(*sides) > CLEAR).any())
+    return n
+
+
+def _corridor(x: Values, y: Values, half: Values) -> tuple[float, float]:
+    """The widest stretch along a row, in metres from its gap's middle, that the gaps thereabouts have in common.
+
+    A few may lack a part of it, and it may run aslant.
+    """
+    middle = x - SLANTS * y
+    low, high = np.quantile(middle - half, MOST, axis=1), np.quantile(middle + half, 1 - MOST, axis=1)
+    widest = np.argmax(high - low - ASKEW * np.abs(SLANTS[:, 0]))
+    return float(low[widest]), float(high[widest])
+
+
+def _posts(gaps: Gaps, k: int, cover: Raster) -> Values:
+    """Places (n,) in metres from its middle of posts in a gap: spots of canopy in line with its ends.
+
+    There is less half a spacing beside them.
+    """
+    length, along = gaps.length[k], gaps.along[k]
+    step = cover.grid.resolution
+    at = np.arange(CLEAR - length / 2, length / 2 - CLEAR, step)
+    if len(at) < 3:
+        return np.empty(0)
+    line = gaps.middle[k] + at[:, None] * along
+    offsets = np.concatenate([np.linspace(-0.1, 0.1, 3), np.linspace(-0.5, -0.3, 3), np.linspace(0.3, 0.5, 3)])
+    seen = sample_across(cover, line, np.broadcast_to([-along[1], along[0]], line.shape), offsets * gaps.spacing[k])
+    on, beside = seen[:, :3].max(axis=1), seen[:, 3:].max()
+    if np.count_nonzero(on > POST / 2) * step >= max(THICK, SPOTS * length):
+        return np.empty(0)
+    spots = find_objects(label(on > POST / 2)[0])
+    out = [at[spot].mean() for (spot,) in spots if on[spot].max() > max(POST, 2 * beside)]
+    return np.array(out)
+
+
+def parts_of(n: int, one: Ints, other: Ints) -> Ints:
+    """Which of what hangs together each of n belongs to, linked in pairs."""
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(n, n))
+    out: Ints = connected_components(graph, directed=False)[1]
+    return out
+
+
+def _open_across(
+    tree: cKDTree, middle: Values, along: Values, length: float, spacing: float, radius: float
+) -> tuple[float, float]:
+    """Rows to the left and to the right up to which the open ground about the middle of a gap goes on."""
+    cells = int(np.ceil((ACROSS + 1) * spacing / STRIDE))
+    across = np.arange(-cells, cells + 1) * STRIDE
+    reach = int(np.ceil((length / 2 + (ACROSS + 1) * spacing) / STRIDE))
+    on = np.arange(-reach, reach + 1) * STRIDE
+    # A track may run aslant, at 45° at the most.
+    inside = np.abs(on) <= length / 2 + np.abs(across)[:, None]
+    normal = np.array([-along[1], along[0]])
+    places = middle + on[None, :, None] * along + across[:, None, None] * normal
+    distance = tree.query(places[inside], distance_upper_bound=radius)[0]
+    free = np.zeros(inside.shape, dtype=bool)
+    free[inside] = np.isinf(distance)
+    ground = label(free)[0]
+    here = ground[cells - 1 : cells + 2, np.abs(on) <= max(length / 2 - radius, 0) + STRIDE]
+    mine = across[np.isin(ground, here[here > 0]).any(axis=1)]
+    left, right = (max(0.0, float(side.max(initial=0.0))) for side in (mine, -mine))
+    # Open ground keeps a radius from rows: the last that it crosses lies that much nearer.
+    return (left + radius) / spacing - MARGIN, (right + radius) / spacing - MARGIN
