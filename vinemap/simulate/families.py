@@ -16,7 +16,7 @@ from vinemap.simulate.rays import Obstacle, Sheet
 from vinemap.simulate.scenes import rows_in, rows_of
 from vinemap.simulate.survey import Survey, simulate
 from vinemap.simulate.terrain import PLACE, hillside, terraced
-from vinemap.simulate.yard import place, posts, yard
+from vinemap.simulate.yard import POSTS, place, posts, yard
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -225,12 +225,15 @@ def _net(rng: np.random.Generator) -> Survey:
 def _matched(rng: np.random.Generator, *, gaps: bool = False) -> Survey:
     """A good flight whose photographs are matched; with gaps, rows of which half is left, bare side by side too."""
     azimuth, sun = rng.uniform(0, 180), rng.uniform(0, 360)
-    rows = _block(rng, n=9, azimuth=azimuth, spacing=rng.uniform(2.2, 2.6), length=rng.uniform(34, 40))
+    spacing, length = rng.uniform(2.2, 2.6), rng.uniform(34, 40)
+    rows = _block(rng, n=9, azimuth=azimuth, spacing=spacing, length=length)
     flight = Matching(sun, rng.uniform(40, 60), pull=rng.uniform(0.0, 0.01), matched=rng.uniform(0.7, 0.85))
     vines: dict[str, Any] = {}
     if gaps:
         across = rng.choice([-1, 1]) * np.array([-rng.uniform(4, 10), 15.0])
-        bare = shapely.LineString([place(PLACE, azimuth, 0, end) for end in across])
+        # Posts stand in it: between two of them it would be a track to anybody.
+        beside = 0.0 if round(length / POSTS) % 2 == 0 else POSTS / 2
+        bare = shapely.LineString([place(PLACE, azimuth, beside, end) for end in across])
         vines = {"bare": bare.buffer(rng.uniform(2, 3)), "gaps": rng.integers(3, 9, 2 * len(rows))}
     return _survey(rng, rows, canopy=vines, obstacles=posts(rows), sensor=flight, density=500.0, noise=0.012)
 

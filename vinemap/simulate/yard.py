@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 Spot = tuple[float, float]
 """x and y, m."""
+POSTS = 5.0
+"""Metres between a row's posts."""
 
 
 def place(centre: Spot, azimuth: float, along: float, across: float) -> Spot:
@@ -26,7 +28,7 @@ def place(centre: Spot, azimuth: float, along: float, across: float) -> Spot:
     return centre[0] + along * cos - across * sin, centre[1] + along * sin + across * cos
 
 
-def posts(rows: Sequence[Array], *, every: float = 5.0, top: float = 2.0, beyond: float = 0.0) -> list[Obstacle]:
+def posts(rows: Sequence[Array], *, every: float = POSTS, top: float = 2.0, beyond: float = 0.0) -> list[Obstacle]:
     """Posts of 8 cm in rows, every so many metres; the outermost stand ``beyond`` m outside of the rows' ends."""
     spots = []
     for row in rows:
