@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
+ALIGNED = 0.87
+"""Cosine of the angle between two key points' rows up to which they may belong to one."""
+
 
 def cluster_rows(
     key_points: gpd.GeoDataFrame,
@@ -95,7 +98,8 @@ def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Value
     direction, along, across : (n,) array
         Direction of the row at each point in radians, semi-axes of its ellipse in metres (Eq. 4–5).
     mutual : bool
-        Whether each of two points must lie in the other's ellipse, so that those of another direction don't link rows.
+        Whether each of two points must lie in the other's ellipse and have its direction, so that where two blocks meet
+        those of one don't link rows of the other.
     """
     n = len(xy)
     cell = max(float(along.max(initial=0)), float(across.max(initial=0)), 1e-6)
@@ -148,7 +152,7 @@ def _linked(
                     u = x * axis[p, 0] + y * axis[p, 1]
                     v = y * axis[p, 0] - x * axis[p, 1]
                     inside += (u / along[p]) ** 2 + (v / across[p]) ** 2 <= 1
-                if inside >= least:
+                if inside >= least and (least == 1 or abs(axis[i, 0] * axis[j, 0] + axis[i, 1] * axis[j, 1]) > ALIGNED):
                     links[i - begin] += 1
                     others.append(np.int32(j))
                     # A graph's zero is no edge, so that points on one spot need a length.
