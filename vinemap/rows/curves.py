@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import geopandas as gpd
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, eye_array
+from scipy.sparse.linalg import matrix_power
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
@@ -33,8 +33,10 @@ LONE_WIDTH, LONE_SHARE = 0.85, 0.25
 a hedge or a bush."""
 BESIDE = 1.3
 """Spacings within which a row runs beside another."""
+AMONG = 4
+"""Rows to either side among which a row stands: blocks differ."""
 LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
-"""Canopy and width of a row, in those of the parcel's typical row."""
+"""Canopy and width of a row, in those of the typical one among which it stands."""
 SPARSE = 0.65
 """Share of the length on which most rows have canopy, as bushes that stand apart do, from which one is a row."""
 CLOSED = 0.9
@@ -234,15 +236,17 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
     out = np.ones(len(rows), dtype=bool)
     pairs = _neighbours(rows)
     enclosed = _enclosed(rows, pairs)
-    beside = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(rows), len(rows)))
-    group = connected_components(beside, directed=False)[1]
+    beside = eye_array(len(rows), format="csr") + coo_array((np.ones(len(pairs)), pairs.T), shape=(len(rows),) * 2)
+    near = matrix_power(beside, AMONG)
     length, amount, width = (np.asarray(v) for v in (rows.length, rows["amount"], rows["width"]))
-    for members in (np.flatnonzero(group == g) for g in np.unique(group)):
-        if len(members) < 3:
+    for k in range(len(rows)):
+        others = near.indices[near.indptr[k] : near.indptr[k + 1]]
+        if len(others) < 3:
             continue
-        typical = members[_typical(amount[members], length[members])]
-        out[members] = amount[members] >= LEAST_AMOUNT * amount[typical]
-        out[members] &= (width[members] <= MOST_WIDTH * width[typical]) | enclosed[members]
+        typical = others[_typical(amount[others], length[others])]
+        out[k] = amount[k] >= LEAST_AMOUNT * amount[typical] and (
+            enclosed[k] or width[k] <= MOST_WIDTH * width[typical]
+        )
     return out
 
 
