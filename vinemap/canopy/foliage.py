@@ -27,6 +27,8 @@ TALL = 0.1
 LOWEST, FOOT, UPPER = 0.15, 0.36, 0.5
 """Metres, and share of a row's height over ``LEAST``, from which its canopy is told from weeds, and share of its height
 from which points are high."""
+STICKING, THIN = 1.3, 0.1
+"""Height, in the row's own, from which points that spread no more than so many metres across it are a post's."""
 GROUND = 0.3
 """Metres above or below the terrain model within which points tell the inter-row's elevation."""
 
@@ -57,7 +59,7 @@ def separate_canopy(
 
     On each side of γ a plane runs from the foot of the vines to the canopy's wall at the elevation of the inter-row
     (Eq. 4–10). A point is canopy if it lies ``margin`` above that plane, where the printed plane cuts through the
-    soil's own noise on flat ground, and as far above the terrain model.
+    soil's own noise on flat ground, and as far above the terrain model. Posts that stick out of low vines are cut off.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ def separate_canopy(
     min_height : float
         Metres from which points are high, or less where the row is low.
     """
-    m = len(sections.row_id)
+    m, top = len(sections.row_id), max_height
     if m:
         spacing = float(sections.spacing.max())
         top, half = canopy_size(sections.points[:, 0], sections.height, spacing, max_height)
@@ -83,7 +85,7 @@ def separate_canopy(
         margin, min_height = min(margin, max(LOWEST, FOOT * (top - LEAST))), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
-    limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height)
+    limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height, top)
     in_threads(
         lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, tall),
         stretches(m),
@@ -122,18 +124,21 @@ def _separate(
     start: Ints,
     points: Values,
     height: Values,
-    limits: tuple[float, float, float, float, float],
+    limits: tuple[float, float, float, float, float, float],
     keep: Flags,
     walls: Values,
     tall: Values,
 ) -> None:
     """Flag the canopy's points of sections; write wall w and level h of both sides, and the share of high points."""
-    margin, half_width, max_height, share, min_height = limits
+    margin, half_width, max_height, share, min_height, top = limits
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
         y, z, up, kept = points[mine, 0], points[mine, 1], height[mine], keep[mine]
         for p in range(len(y)):
             kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
+        if _is_post(y, up, kept, STICKING * top):
+            for p in range(len(y)):
+                kept[p] = kept[p] and up[p] <= top
         for side in range(2):
             sign = 1 - 2 * side
             w, h, distance = _plane(y, z, up, kept, sign, half_width)
@@ -148,6 +153,16 @@ def _separate(
             n += kept[p]
             tall[k] += kept[p] and up[p] >= min_height
         tall[k] /= max(n, 1)
+
+
+@compiled
+def _is_post(y: Values, up: Values, canopy: Flags, low: float) -> bool:
+    """Whether what stands above some height is thin."""
+    n, total, squares = 0, 0.0, 0.0
+    for p in range(len(y)):
+        if canopy[p] and up[p] > low:
+            n, total, squares = n + 1, total + y[p], squares + y[p] ** 2
+    return n > 0 and squares / n - (total / n) ** 2 <= THIN**2
 
 
 @compiled
