@@ -102,7 +102,8 @@ def conform(frame: gpd.GeoDataFrame, layer: str, *, contract: Mapping[str, Layer
         raise ValueError(f"layer {layer} lacks {', '.join(missing)}")
     found = frame[[*columns, "geometry"]]
     kinds = found.dtypes
-    return found.astype({name: kind for name, kind in columns.items() if kinds[name] != kind})
+    other = {name: found[name].astype(kind) for name, kind in columns.items() if kinds[name] != kind}
+    return found.assign(**other) if other else found
 
 
 def labelled(table: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
