@@ -23,6 +23,7 @@ REMARKS = {
     "product/record.py",
     "product/store.py",
     "rows/known.py",
+    "surfaces/lines.py",
 }
 """Files whose sentences are remarks, reasons and warnings."""
 WORDS = 4

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from vinemap import paths
 from vinemap.canopy.classification import classify_points
 from vinemap.canopy.mesh import section_meshes
-from vinemap.canopy.model import CanopyModel, find_canopies, model_sections
+from vinemap.canopy.model import CanopyModel, find_canopies, find_leaves, model_sections
 from vinemap.canopy.numbers import judge_canopies, summarise_rows
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
@@ -27,7 +27,6 @@ from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.crs import project
 from vinemap.geo.main import check_near, corner_of
-from vinemap.geo.raster import grid_over
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
 from vinemap.product.pages.parcel import write_page
@@ -42,12 +41,11 @@ from vinemap.rows.ends import beyond_ends
 from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
-from vinemap.rows.known import follow_lines, lines_here, name_rows, space_lines
+from vinemap.rows.known import follow_lines, name_rows
 from vinemap.rows.numbers import count_missing, describe_rows, number_rows
-from vinemap.surfaces.ceiling import heights_of_vines
 from vinemap.surfaces.cover import canopy_cover
-from vinemap.surfaces.ground import terrain_model
-from vinemap.surfaces.seen import seen_cells
+from vinemap.surfaces.lines import lines_here, space_lines
+from vinemap.surfaces.map import map_surfaces
 from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
@@ -58,7 +56,6 @@ if TYPE_CHECKING:
     import shapely
     from pyproj import CRS
 
-    from vinemap.canopy.points import Sections
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.main import Origin
@@ -97,15 +94,6 @@ class RowMap(NamedTuple):
     gaps: gpd.GeoDataFrame
     remarks: Sequence[str] = ()
     """What is to be known of known rows: a sentence each."""
-
-
-def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster, Seen]:
-    """Find a cloud's terrain: the cloud with its heights above it, the terrain, the canopies' height, what was seen."""
-    dtm = terrain_model(points, **settings.ground.model_dump())
-    cloud, chm = heights_of_vines(points, dtm, resolution=settings.ground.resolution, high=settings.cover.high)
-    seen = seen_cells(points, grid_over(*points.extent, resolution=settings.cover.resolution))
-    cloud.forget()
-    return cloud, dtm, chm, seen
 
 
 def map_rows(
@@ -151,7 +139,8 @@ def map_rows(
     else:
         lines, within = space_lines(lines, field), None
         courses = step("Curves", follow_lines, lines, cover, **options["rows"])
-    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, cover, levels, dtm, seen, within, **options["fit"])
+    shown = {"cover": cover, "levels": levels, "dtm": dtm, "seen": seen}
+    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, **shown, within=within, **options["fit"])
     if lines is not None:
         rows, options["judging"] = space_lines(rows, field), {"min_confidence": 0.0}
     rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm, seen), gaps, **options["judging"])
@@ -161,7 +150,8 @@ def map_rows(
         rows, gaps, told = name_rows(lines, courses, flag_rows(rows), gaps)
         remarks = *remarks, *told
     rows, gaps = count_missing(rows, gaps, **options["missing"])
-    return RowMap(cloud, dtm, chm, cover, seen, refine_row_field(field, rows), len(key_points), rows, gaps, remarks)
+    field, n = refine_row_field(field, rows), len(key_points)
+    return RowMap(cloud, dtm, chm, cover, seen, field, n, rows, gaps, remarks)
 
 
 def map_parcel(
@@ -282,7 +272,8 @@ def follow(
             how: dict[str, Any] = {"date": recipe.flown} | settings.product.model_dump(include={"plain", "geoid"})
             write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, **how)
             if settings.product.classified:
-                classify = partial(classify_points, leaves=_leaves(found, settings))
+                cut = found.cloud, found.rows, found.gaps, found.dtm
+                classify = partial(classify_points, leaves=find_leaves(*cut, settings))
                 write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
 
         run("Writing", write)
@@ -304,12 +295,7 @@ def follow(
 
 def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:
     """The points that a recipe asks for, in memory or in tiles beside the draft."""
-    settings = recipe.settings
-    collector = Collector(
-        paths.tiles(draft),
-        most=settings.reading.max_points or machine.memory() // 2 // BYTES_A_POINT,
-        block=block_side(settings.ground.resolution),
-    )
+    settings, collector = recipe.settings, _collector(recipe.settings, paths.tiles(draft))
     points: Cloud
     if piece:
         points = run("Reading", read_piece, piece, collector)
@@ -323,6 +309,12 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., A
     return points
 
 
+def _collector(settings: Settings, folder: Path) -> Collector:
+    """What takes points, in tiles in a folder beyond what memory is for."""
+    most = settings.reading.max_points or machine.memory() // 2 // BYTES_A_POINT
+    return Collector(folder, most=most, block=block_side(settings.ground.resolution))
+
+
 def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Callable[..., Any] = call) -> CanopyModel:
     """Model the canopies of the rows that were found: sections, their canopy, and its polygons (chapter 3).
 
@@ -334,10 +326,3 @@ def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Cal
     options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
     model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
     return model
-
-
-def _leaves(found: RowMap, settings: Settings) -> list[Sections]:
-    """Canopy points of sections that leave nothing between them."""
-    dense = settings.sections.model_copy(update={"step": min(settings.sections.step, settings.sections.width)})
-    cut = found.cloud, found.rows, found.gaps, found.dtm
-    return [canopy.sections for canopy in find_canopies(*cut, settings.model_copy(update={"sections": dense}))]

@@ -11,12 +11,13 @@ from shapely.ops import substring
 from vinemap.config.settings import KnownRowOptions, Settings
 from vinemap.errors import InputError
 from vinemap.geo.raster import sample
-from vinemap.parcel import map_rows, map_surfaces
-from vinemap.rows import known as module
+from vinemap.parcel import map_rows
 from vinemap.rows.ends import Known, Standing, cut_as_known
 from vinemap.rows.fit import fit_rows
-from vinemap.rows.known import follow_lines, lines_here, name_rows, space_lines
+from vinemap.rows.known import follow_lines, name_rows
 from vinemap.surfaces.cover import canopy_cover
+from vinemap.surfaces.lines import USUAL, lines_here, space_lines
+from vinemap.surfaces.map import map_surfaces
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +170,7 @@ def test_spacing_is_the_mean_of_those_thereabouts_but_for_tracks():
     x = np.array([0, 2.2, 5.3, 7.4, 10.1, 17.0, 19.4])
     lines = gpd.GeoDataFrame(geometry=[shapely.LineString([(v, 0), (v, 40)]) for v in x])
     assert space_lines(lines)["spacing_m"].to_numpy() == pytest.approx(2.5, abs=0.15)
-    assert space_lines(lines.iloc[:1])["spacing_m"].tolist() == [module.USUAL]
+    assert space_lines(lines.iloc[:1])["spacing_m"].tolist() == [USUAL]
 
 
 def test_a_hedge_across_the_end_is_no_part_of_a_row():

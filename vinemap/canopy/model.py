@@ -62,6 +62,15 @@ def find_canopies(
     return living_canopies(canopies, **living)
 
 
+def find_leaves(
+    cloud: Cloud, rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, dtm: Raster, settings: Settings
+) -> list[Sections]:
+    """Canopy points of sections that leave nothing between them; parameters are as of :func:`find_canopies`."""
+    dense = settings.sections.model_copy(update={"step": min(settings.sections.step, settings.sections.width)})
+    all_along = settings.model_copy(update={"sections": dense})
+    return [canopy.sections for canopy in find_canopies(cloud, rows, gaps, dtm, all_along)]
+
+
 def model_sections(
     canopies: Sequence[Canopy], crs: CRS, *, c: int = 7, share: float = 0.02, foot: str = "foliage", min_points: int = 8
 ) -> CanopyModel:
