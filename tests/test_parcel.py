@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from vinemap import paths
 from vinemap.cli.main import commands
+from vinemap.config.settings import Settings
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.export.write import export_products
@@ -168,6 +169,27 @@ def test_rows_of_an_earlier_product_are_measured_again(product, survey, tmp_path
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert [one["file"] for one in record["inputs"]][1:] == ["parcels.gpkg", "rows.gpkg"]
     assert set(STAGES) - set(record["seconds"]) == {"Key points", "Clusters"}
+
+
+def test_a_cloud_is_moved_onto_known_rows(product, survey, tmp_path):
+    """By a run in tiles on disk, of rows that stand elsewhere than they were found."""
+    shift = np.array([0.22, -0.16])
+    found = gpd.read_file(paths.geopackage(product.folder, "A"), layer="rows")
+    rows = found[["row_id", "label", "geometry"]].set_geometry(found.translate(*-shift))
+    rows.to_file(tmp_path / "rows.gpkg", layer="rows")
+    settings = Settings(rows={"align": True}, reading={"max_points": 1000})
+    aligned = map_parcel(survey, tmp_path / "out", parcel="A", rows=tmp_path / "rows.gpkg", settings=settings)
+    assert sorted(path.name for path in aligned.folder.iterdir() if path.is_dir()) == []
+    record = json.loads(paths.run_record(aligned.folder).read_text())
+    told = record["shift"]
+    assert [told["east_m"], told["north_m"]] == pytest.approx(shift, abs=0.03)
+    assert told["in_rows"] is False
+    again = gpd.read_file(paths.geopackage(aligned.folder, "A"), layer="rows")
+    off = shapely.hausdorff_distance(*(shapely.force_2d(table.geometry.to_numpy()) for table in (again, rows)))
+    assert np.median(off) < 0.1
+    with rasterio.open(paths.raster(aligned.folder, "A", "chm")) as chm:
+        points = shapely.line_interpolate_point(rows.geometry, 0.3, normalized=True)
+        assert np.median([value[0] for value in chm.sample([(p.x, p.y) for p in points])]) > 1.5
 
 
 def test_rasters(product):

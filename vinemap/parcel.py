@@ -17,12 +17,13 @@ from vinemap.canopy.numbers import judge_canopies, summarise_rows
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
-from vinemap.cloud.tiles import Collector
+from vinemap.cloud.tiles import Collector, moved
 from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.confidence import believed, judge_rows
+from vinemap.evaluate.shift import Shift, measure_shift
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.crs import project
@@ -94,6 +95,8 @@ class RowMap(NamedTuple):
     gaps: gpd.GeoDataFrame
     remarks: Sequence[str] = ()
     """What is to be known of known rows: a sentence each."""
+    shift: Shift | None = None
+    """How far the cloud lies off them, where that is told."""
 
 
 def map_rows(
@@ -138,10 +141,14 @@ def map_rows(
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
     else:
         lines, within = space_lines(lines, field), None
-        courses = step("Curves", follow_lines, lines, cover, **options["rows"])
+        courses = step("Curves", follow_lines, lines, cover, **_how(settings))
     shown = {"cover": cover, "levels": levels, "dtm": dtm, "seen": seen}
-    rows, gaps = step("Ends and gaps", fit_rows, courses, cloud, **shown, within=within, **options["fit"])
+    fit: Callable[..., Any] = partial(fit_rows, cloud=cloud, **shown, **options["fit"])
+    rows, gaps = step("Ends and gaps", fit, courses, within=within)
+    shift = None
     if lines is not None:
+        free = follow_lines(lines, cover) if "keep" in _how(settings).values() else courses
+        shift = measure_shift(lines, rows if free is courses else fit(free)[0], free["moves"].to_numpy())
         rows, options["judging"] = space_lines(rows, field), {"min_confidence": 0.0}
     rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm, seen), gaps, **options["judging"])
     if lines is None:
@@ -151,7 +158,12 @@ def map_rows(
         remarks = *remarks, *told
     rows, gaps = count_missing(rows, gaps, **options["missing"])
     field, n = refine_row_field(field, rows), len(key_points)
-    return RowMap(cloud, dtm, chm, cover, seen, field, n, rows, gaps, remarks)
+    return RowMap(cloud, dtm, chm, cover, seen, field, n, rows, gaps, remarks, shift)
+
+
+def _how(settings: Settings) -> dict[str, Any]:
+    """What of known rows may move."""
+    return settings.rows.model_dump(include={"course", "ends"})
 
 
 def map_parcel(
@@ -247,7 +259,11 @@ def follow(
             check_near(origin, points.extent[0], points.crs)
         polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
         known = recipe.known.lines if recipe.known else None
+        shift = None
+        if known is not None and settings.rows.align and (shift := map_rows(points, settings, known=known).shift):
+            points = moved(points, -shift.metres, _collector(settings, paths.tiles(draft) / "moved"))
         found = map_rows(points, settings, within=polygon, known=known, step=run)
+        shift = shift or found.shift
         model, apart = model_canopies(found, settings, step=run), settings.sections.step
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
@@ -278,7 +294,7 @@ def follow(
 
         run("Writing", write)
         about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
-        about["remarks"] = found.remarks
+        about |= {"remarks": found.remarks, "shift": shift}
         record = record_of(recipe, found.cloud, layers, (found.dtm, found.chm), origin=main, **about)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)

@@ -117,6 +117,21 @@ def test_what_was_not_seen_on_one_date_is_no_change():
     assert np.isnan([none[name] for name in ("d_gap_m", "d_n_missing", "d_volume")]).all()
 
 
+def test_a_shift_that_is_known_is_taken_out():
+    """One of more than half the spacing, which rows alone don't tell."""
+    lines = rows_of(6, length=40, azimuth=20)
+    far = np.array([0.5, 1.6])
+    tables = [table([lines[k] + far for k in (0, 1, 2, 4, 5)]), table(lines)]
+    assert states(compare_rows(*tables)) != states(compare_rows(*tables, shift=tuple(far)))
+    changes = compare_rows(*tables, shift=tuple(far))
+    assert changes.shift == pytest.approx(far)
+    assert states(changes) == {
+        *(("same", f"{now} F", f"{then} F") for now, then in ((1, 1), (2, 2), (3, 3), (4, 5), (5, 6))),
+        ("gone", None, "4 F"),
+    }
+    assert [found.tolist() for found in follow_rows(tables, shifts=[tuple(far)])] == [[*range(5)], [0, 1, 2, 5, 3, 4]]
+
+
 def test_rows_are_followed_through_dates_on_which_they_arent():
     """Four flights, each off the others: one row is missed once, one is gone, one is new."""
     lines = rows_of(6, length=40, azimuth=20)

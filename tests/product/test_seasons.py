@@ -18,7 +18,7 @@ from vinemap.product.pages.page import page, repacked, unpacked
 from vinemap.product.pages.survey import write_index
 from vinemap.product.recipe import product_in
 from vinemap.product.seasons.history import history
-from vinemap.product.seasons.products import read_products, read_rows
+from vinemap.product.seasons.products import read_products, read_rows, shift_between
 
 FLOWN = {"april": "2026-04-20", "june": "2026-06-18", "fall": "2026-09-14"}
 
@@ -62,6 +62,27 @@ def read(monkeypatch):
 
     monkeypatch.setattr(changes, "read_rows", noted)
     return seen
+
+
+def test_shifts_against_the_same_known_rows_tell_that_between_flights(estate):
+    """Half a metre more than the rows themselves show; but not where either isn't told whole."""
+    told = {"east_m": 0.3, "north_m": -0.1, "east_sd_m": 0.01, "north_sd_m": 0.02, "in_rows": True, "known_rows": "k"}
+
+    def stated(**fall):
+        for survey, shift in (("june", told), ("fall", told | fall)):
+            path = paths.run_record(estate / survey / "A")
+            path.write_text(json.dumps(json.loads(path.read_text()) | {"shift": shift}))
+        (later,), (earlier,) = (
+            [one for one in read_products(estate / survey) if one.parcel == "A"] for survey in ("fall", "june")
+        )
+        return later, earlier
+
+    assert shift_between(*stated(north_m=0.4)) == pytest.approx((0, 0.5))
+    assert shift_between(*stated(in_rows=False)) == pytest.approx((-0.3, 0.1))
+    assert shift_between(*stated(known_rows="others")) is None
+    assert shift_between(*stated(north_sd_m=None)) is None
+    later, earlier = stated(north_m=0.4)
+    assert changes.tell_parcel(later, [earlier], "EPSG:32632")["told"]["shift"] == pytest.approx((0, 0.5))
 
 
 def details(folder):

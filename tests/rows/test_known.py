@@ -187,4 +187,4 @@ def test_a_hedge_across_the_end_is_no_part_of_a_row():
 
 
 def test_options_are_those_of_the_settings():
-    assert Settings().rows == KnownRowOptions(course="fit", ends="fit")
+    assert Settings().rows == KnownRowOptions(course="fit", ends="fit", align=False)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.compute.arrays import Floats
+    from vinemap.compute.arrays import Floats, Values
     from vinemap.geo.raster import Raster
 
 CHUNK = 1_000_000
@@ -150,6 +150,20 @@ class Collector:
             low, high = extent(points)
             old = self.tiles.get(path, Tile(path, low, high, 0))
             self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))
+
+
+def moved(cloud: Cloud, by: Values, collector: Collector) -> Cloud:
+    """A cloud, without heights, moved by metres (2,) to the east and north.
+
+    Tiles are dealt anew to a collector, as their edges are those of the rasters' cells, which stay.
+    """
+    way = np.append(by, 0.0)
+    if isinstance(cloud, PointCloud):
+        return replace(cloud, xyz=cloud.xyz + way, _kept={})
+    for part in cloud.parts():
+        collector.add(part.xyz + way)
+    everywhere = np.full(3, np.inf)
+    return replace(collector.cloud(cloud.crs, cloud.vertical, -everywhere, everywhere), remarks=cloud.remarks)
 
 
 def _between(tile: Tile, least: Floats, most: Floats) -> Tile:

@@ -101,6 +101,7 @@ class KnownRowOptions(Options):
 
     course: Literal["fit", "keep"] = Field("fit", description="whether a line moves sideways onto its canopy, or stays")
     ends: Literal["fit", "keep"] = Field("fit", description="whether its ends move to its canopy's, or stay")
+    align: bool = Field(default=False, description="whether the cloud is moved onto them first, by its shift")
 
 
 class CurveOptions(Options):

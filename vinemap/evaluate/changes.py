@@ -1,7 +1,7 @@
 """What has changed between two surveys of a parcel, row by row.
 
 Rows are the same where they stand in the same place, whatever they are called. As two flights may lie some decimetres
-apart, the shift between them is found first, from all rows together.
+apart, the shift between them is found first, from all rows together, unless known rows have told it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,12 @@ class Changes(NamedTuple):
 
 
 def compare_rows(
-    later: gpd.GeoDataFrame, earlier: gpd.GeoDataFrame, *, overlap: float = 0.5, width: float = 0.6
+    later: gpd.GeoDataFrame,
+    earlier: gpd.GeoDataFrame,
+    *,
+    shift: tuple[float, float] | None = None,
+    overlap: float = 0.5,
+    width: float = 0.6,
 ) -> Changes:
     """Match the rows of two dates one to one, and tell what has changed.
 
@@ -65,6 +70,8 @@ def compare_rows(
     ----------
     later, earlier : GeoDataFrame
         Layer ``rows`` of the two products, each in any projected CRS in metres; without ``unseen_m`` all was seen.
+    shift : (float, float), optional
+        Metres to the east and north by which the later rows lie off the earlier ones; by default estimated.
     overlap : float
         Share of the longer row along which two must run beside each other to be the same.
     width : float
@@ -76,8 +83,8 @@ def compare_rows(
         shapely.simplify(shapely.force_2d(table.geometry.to_numpy()), TOLERANCE)
         for table in (later, earlier.to_crs(later.crs))
     )
-    shift = estimate_shift(lines, before, spacing=spacing, overlap=overlap, width=near)
-    moved = _move(lines, -shift)
+    told = estimate_shift(lines, before, spacing=spacing, overlap=overlap, width=near) if shift is None else shift
+    moved = _move(lines, -np.asarray(told))
     j, i = match_rows(moved, before, overlap=overlap, width=near).T
     was = np.full(len(lines), NONE)
     was[j] = i
@@ -98,10 +105,15 @@ def compare_rows(
         now, then = (_column(table, name, places) for table, places in pairs)
         gained = np.where(hidden, np.nan, now - then) if name in SUMS else now - then
         columns |= {name: np.where(state == GONE, then, now), f"d_{name}": gained}
-    return Changes((round(float(shift[0]), 3), round(float(shift[1]), 3)), pd.DataFrame(columns))
+    return Changes((round(float(told[0]), 3), round(float(told[1]), 3)), pd.DataFrame(columns))
 
 
-def follow_rows(dates: Sequence[gpd.GeoDataFrame], *, latest: Changes | None = None) -> list[NDArray[np.intp]]:
+def follow_rows(
+    dates: Sequence[gpd.GeoDataFrame],
+    *,
+    shifts: Sequence[tuple[float, float] | None] | None = None,
+    latest: Changes | None = None,
+) -> list[NDArray[np.intp]]:
     """Follow the rows of a parcel back through its dates.
 
     Each date is compared with all rows that are known of later ones, each of these where it stood last.
@@ -110,6 +122,8 @@ def follow_rows(dates: Sequence[gpd.GeoDataFrame], *, latest: Changes | None = N
     ----------
     dates : sequence of GeoDataFrame
         Layer ``rows`` of the products, the latest first.
+    shifts : sequence of (float, float) or None, optional
+        By which the latest lies off each of the others, where it is known.
     latest : Changes, optional
         Those between the first two, where they are known.
 
@@ -120,8 +134,9 @@ def follow_rows(dates: Sequence[gpd.GeoDataFrame], *, latest: Changes | None = N
         position at the latest date, and from there on what is there no more.
     """
     known, numbers = dates[0], [np.arange(len(dates[0]))]
-    for k, table in enumerate(dates[1:]):
-        shift, changes = latest if latest and k == 0 else compare_rows(known, table)
+    apart = shifts or [None] * (len(dates) - 1)
+    for k, (table, told) in enumerate(zip(dates[1:], apart, strict=True)):
+        shift, changes = latest if latest and k == 0 else compare_rows(known, table, shift=told)
         place, earlier = changes["place"].to_numpy(), changes["earlier_place"].to_numpy()
         found = np.full(len(table), NONE)
         there = (place != NONE) & (earlier != NONE)

@@ -21,7 +21,7 @@ from vinemap.evaluate.changes import follow_rows
 from vinemap.export.field import read_record
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.product.layers import REAL, TEXT, WHOLE
-from vinemap.product.seasons.products import Product, read_product, same_places
+from vinemap.product.seasons.products import Product, read_product, same_places, shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -200,7 +200,9 @@ def _follow(flights: Sequence[_Product]) -> list[list[str]]:
     """Names of the rows of each flight of a parcel, the latest first, the same where a row is."""
     names: dict[int, str] = {}
     found = []
-    for one, numbers in zip(flights, follow_rows([one.rows for one in flights]), strict=True):
+    places = [one.place for one in flights]
+    shifts = [shift_between(places[0], one) if places[0] and one else None for one in places[1:]]
+    for one, numbers in zip(flights, follow_rows([one.rows for one in flights], shifts=shifts), strict=True):
         since = "" if one is flights[0] else f" ({one.about['flown']})"
         for number, label in zip(numbers.tolist(), one.rows["label"], strict=True):
             names.setdefault(number, f"{label}{since}")

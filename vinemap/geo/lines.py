@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from functools import partial
 from itertools import count
@@ -48,6 +49,12 @@ class KnownRows(NamedTuple):
     lines: gpd.GeoDataFrame
     """LineString in plan, from e1 to en, with ``row_id`` and ``label``, in the order of the file."""
     remarks: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """What tells where they are from others."""
+        shapes = b"".join(shapely.to_wkb(self.lines.geometry.to_numpy()))
+        return hashlib.sha256(self.lines.crs.to_string().encode() + shapes).hexdigest()
 
 
 def read_rows(path: Path, *, crs: CRS | None = None, local: bool = False) -> KnownRows:

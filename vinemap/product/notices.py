@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import NDArray
 
+    from vinemap.evaluate.shift import Shift
     from vinemap.geo.raster import Grid, Raster
 
 SIDE = 2.0
@@ -28,6 +29,8 @@ SURE = 0.5
 """Confidence of a row that is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
+ASIDE = 0.4
+"""Spacings by which a flight may lie off known rows before these are mistaken."""
 STEP = 0.5
 """Metres between the points of rows."""
 TOP = 0.98
@@ -75,6 +78,25 @@ def notices(
     }
     told = [remark for remark, holds in remarks.items() if holds] + _doubtful_canopies(rows)
     return told + (_in_no_row(unmapped) if len(rows) else [_why_nothing(unmapped, density)])
+
+
+def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
+    """That a flight lies so far off known rows that each may be taken for the next.
+
+    Parameters
+    ----------
+    shift : Shift or None
+        How far it lies off.
+    rows : GeoDataFrame
+        With ``spacing_m``.
+    """
+    if shift is None or shift.length <= ASIDE * float(rows["spacing_m"].median()):
+        return []
+    remark = (
+        f"the flight lies {shift.length:.2f} m off the known rows, almost half of their distance or more: a row may "
+        "have been taken for the next; see that both have the right CRS and the same base station"
+    )
+    return [remark]
 
 
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:

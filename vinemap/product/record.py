@@ -11,7 +11,7 @@ import shapely
 from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
 from vinemap.geo.place import doubts_of
-from vinemap.product.notices import height_notices, notices, sight_notices
+from vinemap.product.notices import height_notices, notices, shift_notices, sight_notices
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.cloud.tiles import Cloud
+    from vinemap.evaluate.shift import Shift
     from vinemap.geo.main import Corner, Origin
     from vinemap.geo.raster import Raster
     from vinemap.product.recipe import Recipe
@@ -63,6 +64,7 @@ def record_of(
     n_key_points: int,
     square: bool = False,
     remarks: Sequence[str] = (),
+    shift: Shift | None = None,
 ) -> dict[str, Any]:
     """What ``run.json`` tells, but for times and files.
 
@@ -84,6 +86,8 @@ def record_of(
         Whether rows could as well run another way.
     remarks : sequence of str
         What is to be known of known rows.
+    shift : Shift, optional
+        How far the cloud lies off them, or lay before it was moved.
     """
     dtm, chm = surfaces
     sections = layers["sections"]
@@ -106,8 +110,10 @@ def record_of(
         "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
+        "shift": _shift(shift, recipe),
         "warnings": _places(recipe, points)
         + [*(recipe.known.remarks if recipe.known else ()), *remarks]
+        + shift_notices(shift, layers["rows"])
         + _flights(points, dtm)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])
@@ -115,6 +121,14 @@ def record_of(
         + [SQUARE] * (square and not recipe.known),
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
     }
+
+
+def _shift(shift: Shift | None, recipe: Recipe) -> dict[str, Any] | None:
+    """How far a cloud lies off known rows, off which ones, and whether the product's rows do."""
+    if shift is None or recipe.known is None:
+        return None
+    how = recipe.settings.rows
+    return shift.record() | {"in_rows": how.course == "fit" and not how.align, "known_rows": recipe.known.key}
 
 
 def _flights(points: Cloud, dtm: Raster) -> list[str]:

@@ -46,7 +46,8 @@ class Standing(NamedTuple):
     """Curve (n, 2), its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
 
     ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it. Before
-    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle.
+    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle. ``told`` says of either
+    end whether canopy tells it, as it does unless the end is known and nothing ends near it.
     """
 
     curve: Values
@@ -54,6 +55,7 @@ class Standing(NamedTuple):
     contrast: float
     goes_on: tuple[bool, bool] = (False, False)
     sides: Values = NOTHING
+    told: tuple[bool, bool] = (True, True)
 
     @property
     def length(self) -> float:
@@ -138,12 +140,14 @@ def cut_as_known(rows: Sequence[Standing], known: Sequence[Known]) -> list[Stand
     off = np.abs(seen - bounds)
     most = NEAR + SPREAD * float(np.median(off[np.isfinite(off)])) if np.isfinite(off).any() else 0.0
     places = np.where(off <= most, seen, bounds)
-    places = np.where(np.diff(places) > 0, places, bounds)
+    whole = np.diff(places) > 0
+    places = np.where(whole, places, bounds)
     out = []
-    for row, (start, end) in zip(rows, places, strict=True):
+    for row, (start, end), (first, last) in zip(rows, places, (off <= most) & whole, strict=True):
         runs = np.clip(row.runs, start, end)
         runs = runs[np.diff(runs, axis=1)[:, 0] > 0]
-        out.append(Standing(between(row.curve, start, end), runs - start, row.contrast))
+        curve = between(row.curve, start, end)
+        out.append(Standing(curve, runs - start, row.contrast, told=(bool(first), bool(last))))
     return out
 
 
@@ -208,7 +212,8 @@ def lay_out(
     -------
     rows, gaps : GeoDataFrame
         LineStringZ with ``spacing_m``, ``gap_m`` and ``unseen_m`` (length of gaps of either state), ``support`` (share
-        of the length that was seen with canopy) and ``contrast``; LineStringZ with ``row`` (position in rows),
+        of the length that was seen with canopy), ``contrast``, and ``start_told`` and ``end_told``, whether canopy
+        tells where the row ends; LineStringZ with ``row`` (position in rows),
         ``start_m``, ``end_m``, ``length_m`` along γ and ``state`` ("missing", "unseen").
     """
     rows: list[tuple[object, ...]] = []
@@ -222,9 +227,9 @@ def lay_out(
             bare, hidden = (sum(b - a for a, b, state in found if state == one) for one in (MISSING, UNSEEN))
             support = float(np.diff(row.runs, axis=1).sum() / max(row.length - hidden, CELL))
             line = _line(resample(row.curve, VERTEX), dtm)
-            rows.append((spacing, float(bare), float(hidden), support, row.contrast, line))
+            rows.append((spacing, float(bare), float(hidden), support, row.contrast, *row.told, line))
     return (
-        _frame(rows, ["spacing_m", "gap_m", "unseen_m", "support", "contrast"], dtm),
+        _frame(rows, ["spacing_m", "gap_m", "unseen_m", "support", "contrast", "start_told", "end_told"], dtm),
         _frame(gaps, ["row", "start_m", "end_m", "length_m", "state"], dtm),
     )
 

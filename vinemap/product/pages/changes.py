@@ -12,7 +12,7 @@ from vinemap.evaluate.changes import GONE, compare_rows, summarise
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.pages.page import mean_of, polylines
 from vinemap.product.seasons.history import history
-from vinemap.product.seasons.products import read_rows
+from vinemap.product.seasons.products import read_rows, shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,7 +52,7 @@ def tell_parcel(product: Product, earlier: Sequence[Product], crs: CRS) -> dict[
     def drawn(lines: gpd.GeoSeries) -> list[list[list[float]]]:
         return polylines(lines.to_crs(crs), zero, tolerance=TOLERANCE, digits=1)
 
-    compared = _compare(rows, before[0], earlier[0]) if earlier else {}
+    compared = _compare(rows, before[0], product, earlier[0]) if earlier else {}
     found: dict[str, Any] = {
         "zero": zero,
         "told": _numbers(rows)
@@ -84,7 +84,9 @@ def _numbers(rows: gpd.GeoDataFrame | None) -> dict[str, Any]:
     return told | {"rows": len(rows), "height_m": mean_of(rows["height_m"], length)}
 
 
-def _compare(rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, before: Product) -> dict[str, Any]:
+def _compare(
+    rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, product: Product, before: Product
+) -> dict[str, Any]:
     """What has changed in a parcel since a product, or why nothing can be said."""
     told: dict[str, Any] = {
         "since": {"survey": before.survey, "parcel": before.parcel, "flown": before.flown.isoformat()}
@@ -92,7 +94,7 @@ def _compare(rows: gpd.GeoDataFrame | None, earlier: gpd.GeoDataFrame | None, be
     if rows is None or earlier is None:
         return told | {"remark": f"rows of {'this' if rows is None else 'the earlier'} survey can't be read"}
     try:
-        changes = compare_rows(rows, earlier)
+        changes = compare_rows(rows, earlier, shift=shift_between(product, before))
     except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
         return told | {"remark": f"can't be compared ({type(error).__name__})"}
     table = changes.rows

@@ -9,6 +9,7 @@ import numpy as np
 from vinemap.evaluate.changes import follow_rows
 from vinemap.product.notices import SURE
 from vinemap.product.pages.page import whole_numbers
+from vinemap.product.seasons.products import shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +42,8 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
         canopy's numbers are.
     """
     tables = [rows for _, rows in flights]
-    numbers = follow_rows(tables, latest=latest)
+    shifts = [shift_between(flights[0][0], one) for one, _ in flights[1:]]
+    numbers = follow_rows(tables, shifts=shifts, latest=latest)
     shape = int(max(found.max(initial=-1) for found in numbers)) + 1, len(flights)
     labels = np.full(shape, None, dtype=object)
     doubtful = np.zeros(shape, dtype=int)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyogrio
@@ -46,6 +46,8 @@ class Product(NamedTuple):
     """What tells this product from others."""
     told: str
     """What tells the seasons that its page shows from others; nothing while it shows none."""
+    off: tuple[str, float, float] | None = None
+    """Which known rows its rows lie off, and by how many metres to the east and north, where both are told."""
 
 
 def read_products(folder: Path) -> Iterator[Product]:
@@ -87,12 +89,28 @@ def read_product(place: Path) -> Product | None:
                 [record["key"], {name: n for name, n in record["files"].items() if name != linked["report"].name}]
             ),
             str(record.get("seasons", "")),
+            _off(record.get("shift")),
         )
         west, south, east, north = shapely.bounds(outline)  # NaN of an empty one
         placed = local or (-180 <= west <= east <= 180 and -90 <= south <= north <= 90)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, shapely.errors.ShapelyError):
         return None
     return product if product.flown.tzinfo and placed else None
+
+
+def _off(told: dict[str, Any] | None) -> tuple[str, float, float] | None:
+    """What a record tells of the shift of a product's rows, if it does in all directions."""
+    if not told or None in (told["east_sd_m"], told["north_sd_m"]):
+        return None
+    east, north = (float(told[name]) if told["in_rows"] else 0.0 for name in ("east_m", "north_m"))
+    return str(told["known_rows"]), east, north
+
+
+def shift_between(later: Product, earlier: Product) -> tuple[float, float] | None:
+    """Metres to the east and north by which a product's rows lie off an earlier one's, if both state the same rows."""
+    if not later.off or not earlier.off or (later.off[0], later.crs) != (earlier.off[0], earlier.crs):
+        return None
+    return later.off[1] - earlier.off[1], later.off[2] - earlier.off[2]
 
 
 def _local_outline(folder: Path, parcel: str) -> shapely.Geometry:
