@@ -93,6 +93,22 @@ def test_a_line_without_canopy_stays_and_says_so(seen, truth):
     assert told == ["1 of 7 known rows have no canopy: r1"]
 
 
+@pytest.mark.parametrize("aside", [0.9, -1.0, 0.2])
+def test_two_lines_do_not_end_on_one_row(seen, truth, aside):
+    """The false one comes first or last, and may be nearly where the row is."""
+    false = moved(substring(truth[2], 2, 20), aside=aside)
+    for lines, place in (([false, *truth], 0), ([*truth, false], 6)):
+        rows, _, told = measure(seen, [moved(line, aside=0.1) for line in lines])
+        expected = [*truth]
+        expected.insert(place, false)
+        assert off(rows, expected).max() < 0.15
+        assert rows["flags"].tolist()[place] in {"kept", "no_canopy"}
+        assert rows["flags"].tolist().count("") == 6
+        pair = f"r{place + 1} (that of r{3 + (place == 0)})"
+        remark = "1 of 7 known rows would have come to lie on the canopy of another, and stay where they are: "
+        assert told[0] == remark + pair
+
+
 def test_what_was_not_seen_of_a_line_is_told(seen, truth):
     """A void in the middle of one on which nothing stands."""
     cloud, dtm, chm, shown, cover, levels = seen

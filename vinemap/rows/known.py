@@ -22,7 +22,7 @@ from vinemap.rows.centre_line import whittaker
 from vinemap.surfaces.lines import PARALLEL, STEP
 
 if TYPE_CHECKING:
-    from vinemap.compute.arrays import Values
+    from vinemap.compute.arrays import Flags, Ints, Values
 
 CELLS = 48
 """Cells of a spacing across a line."""
@@ -41,12 +41,16 @@ apart."""
 PAIR, UNEVEN, DIP = 0.65, 0.15, 0.7
 """Distance of a row's curtains in that to the next row's, share of it by which they may lie unevenly, and cover between
 them in theirs, at the most."""
+ONE_ROW = 0.3
+"""Spacings within which two lines that have moved lie on one row, if it is along half of the shorter one."""
 THIN, LEAST = 0.02, 0.15
 """Metres of full cover across a line, and share of what is usual, below which there is no canopy."""
 ENOUGH = 0.25
 """Share of a line that has canopy, or its course isn't told by it."""
 REACH, ROOM = 3.0, 3.5
 """Metres by which an end may move, and that are looked at beyond it."""
+NONE = -1
+"""Position of no line."""
 AHEAD = 0.3
 """Spacings from a line carried on within which another that it would meet lies ahead."""
 
@@ -65,6 +69,8 @@ class _Wave(NamedTuple):
 def follow_lines(lines: gpd.GeoDataFrame, cover: Raster, *, course: str = "fit", ends: str = "fit") -> gpd.GeoDataFrame:
     """Move lines sideways onto their canopy, each to the nearest row that all those thereabouts agree upon.
 
+    Of two that would come to lie on one row, that stays which would have had to move more.
+
     Parameters
     ----------
     lines : GeoDataFrame
@@ -80,8 +86,8 @@ def follow_lines(lines: gpd.GeoDataFrame, cover: Raster, *, course: str = "fit",
         The courses in the lines' order, with ``spacing_m``, ``curtains_m`` and ``alone`` as of
         :func:`vinemap.rows.curves.trace_rows`; ``moves``, whether the fit may move the course further; ``slack_m`` by
         which ends may move, ``before_m`` and ``after_m`` beyond them that are the row's own; ``least_m`` of full cover
-        across, below which there is no canopy; and ``kept``, whether nothing shows where the row runs, though it might
-        move.
+        across, below which there is no canopy; ``kept``, whether nothing shows where the row runs, though it might
+        move; and ``taken_by``, the position of the line that has its row, -1 of none.
     """
     spacing = lines["spacing_m"].to_numpy(dtype=float)
     shapes = shapely.force_2d(lines.geometry.to_numpy())
@@ -96,8 +102,10 @@ def follow_lines(lines: gpd.GeoDataFrame, cover: Raster, *, course: str = "fit",
     curtains = pd.Series(curtains[near[1].astype(int)]).groupby(near[0]).median().to_numpy()
     apart = (apart > 0) & [np.mean(wave.amount > least) >= ENOUGH for wave in waves]
     aside = _together(np.where(apart, weight, 0), near) * spacing
+    taken_by = _taken_by([_moved(*one) for one in zip(waves, shifts, strict=True)], shifts, aside, spacing, apart)
+    apart &= taken_by < 0
     curves = [
-        wave.curve + (shift if told else np.full(len(shift), own))[:, None] * normals(wave.curve, smoothing=1 / STEP)
+        _moved(wave, shift if told else np.full(len(shift), own))
         for wave, shift, told, own in zip(waves, shifts, apart, aside, strict=True)
     ]
     if course == "keep":
@@ -114,6 +122,7 @@ def follow_lines(lines: gpd.GeoDataFrame, cover: Raster, *, course: str = "fit",
         "after_m": after,
         "least_m": least,
         "kept": ~apart & ("fit" in (course, ends)),
+        "taken_by": taken_by if course == "fit" else NONE,
     }
     return gpd.GeoDataFrame(table, geometry=courses, crs=lines.crs)
 
@@ -126,7 +135,7 @@ def name_rows(
     Parameters
     ----------
     lines, courses : GeoDataFrame
-        The known lines with ``row_id`` and ``label``, and their courses with ``kept``.
+        The known lines with ``row_id`` and ``label``, and their courses with ``kept`` and ``taken_by``.
     rows : GeoDataFrame
         In the lines' order, with ``support`` and ``flags``, to which ``no_canopy`` and ``kept`` are added.
     gaps : GeoDataFrame
@@ -147,8 +156,13 @@ def name_rows(
     of = gaps["row"].to_numpy(dtype=np.int64)
     gaps = gaps.assign(row_id=rows["row_id"].to_numpy()[of]).iloc[np.lexsort((gaps["start_m"], of))]
     gaps = gaps.drop(columns="row").reset_index(drop=True)
-    (empty, still), n = (rows["label"][some].tolist() for some in (bare, kept)), len(rows)
+    by = courses["taken_by"].to_numpy()
+    lost, label = np.flatnonzero(by != NONE), rows["label"].to_numpy()
+    (empty, still), n = (rows["label"][some].tolist() for some in (bare, kept & (by == NONE))), len(rows)
+    pairs = [f"{one} (that of {other})" for one, other in zip(label[lost], label[by[lost]], strict=True)]
     remarks = {
+        f"{len(pairs)} of {n} known rows would have come to lie on the canopy of another, and stay where they are: "
+        f"{some_of(pairs)}": pairs,
         f"{len(empty)} of {n} known rows have no canopy: {some_of(empty)}": empty,
         f"nothing shows where {len(still)} of {n} known rows run, as canopies are closed or too few: they are kept as "
         f"given, or moved with those around: {some_of(still)}": still,
@@ -217,6 +231,32 @@ def _across(wave: _Wave, shift: Values, spacing: float, cover: Raster) -> tuple[
     double = dip < DIP * min(right.max(), left.max()) and np.ptp(peaks) <= UNEVEN * peaks.sum()
     double &= peaks.sum() <= PAIR * (CELLS - peaks.sum())
     return apart, float(peaks.sum()) / CELLS * spacing if double else 0.0
+
+
+def _moved(wave: _Wave, shift: Values) -> Values:
+    """A line's stations (n, 2), moved to the left by metres (n,)."""
+    out: Values = wave.curve + shift[:, None] * normals(wave.curve, smoothing=1 / STEP)
+    return out
+
+
+def _taken_by(curves: list[Values], shifts: list[Values], aside: Values, spacing: Values, apart: Flags) -> Ints:
+    """The line (n,) that has the row on which one would come to lie with it, and to which it is nearer; or none.
+
+    How near is counted from where all lines thereabouts lie.
+    """
+    courses = [shapely.LineString(curve) for curve in curves]
+    miss = np.array([np.abs(shift - own).mean() for shift, own in zip(shifts, aside, strict=True)])
+    rank = np.lexsort((np.arange(len(miss)), miss)).argsort()
+    i, j = shapely.STRtree(courses).query(courses, predicate="dwithin", distance=ONE_ROW * spacing)
+    near = apart[i] & apart[j] & (rank[j] < rank[i])
+    pairs = np.column_stack([i, j])[near]
+    out = np.full(len(courses), NONE)
+    for worse, better in pairs[np.argsort(rank[pairs[:, 1]], kind="stable")].tolist():
+        shorter, longer = sorted((worse, better), key=lambda k: len(curves[k]))
+        beside = shapely.dwithin(shapely.points(curves[shorter]), courses[longer], ONE_ROW * spacing[worse])
+        if out[worse] == out[better] == NONE and beside.mean() > 0.5:
+            out[worse] = better
+    return out
 
 
 def _own_room(courses: list[shapely.LineString], spacing: Values) -> Values:
