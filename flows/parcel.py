@@ -52,6 +52,7 @@ def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
         survey=survey,
         rows=config.rows,
         rows_crs=parse_crs(config.rows_crs) if config.rows_crs else None,
+        vines=config.vines,
         **dict(config.of_parcel(parcel)),
     )
     products = paths.survey_products(survey)

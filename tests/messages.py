@@ -12,6 +12,7 @@ DEVELOPERS = {"measure", "simulate"}
 REMARKS = {
     "cloud/las_end.py",
     "errors.py",
+    "evaluate/trunks.py",
     "geo/boundaries.py",
     "geo/lines.py",
     "geo/place.py",

@@ -192,6 +192,33 @@ def test_a_cloud_is_moved_onto_known_rows(product, survey, tmp_path):
         assert np.median([value[0] for value in chm.sample([(p.x, p.y) for p in points])]) > 1.5
 
 
+def test_vines_stand_where_they_were_surveyed(vineyard, survey, tmp_path):
+    """In a file in degrees, with a point that is no vine, beside layers of other things."""
+    lines = shapely.force_2d(vineyard.rows.geometry.to_numpy())
+    share = [(np.arange(n) + 0.5) / n for n in vineyard.rows["n_vines"]]
+    points = np.concatenate(
+        [shapely.line_interpolate_point(line, own, normalized=True) for line, own in zip(lines, share, strict=True)]
+    )
+    stray = shapely.Point(shapely.get_coordinates(points[0])[0] - [5, 0])
+    path = tmp_path / "planted.gpkg"
+    gpd.GeoDataFrame(geometry=lines, crs=32632).to_file(path, layer="rows")
+    gpd.GeoDataFrame(geometry=[*points, stray], crs=32632).to_crs(4326).to_file(path, layer="vines")
+    words = ["run", survey, "--parcel", "A", "--rows", path, "--vines", path, "--out", tmp_path / "out"]
+    done = CliRunner().invoke(commands, [str(word) for word in words], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert f"1 of {len(points) + 1} known vines stand farther than half a spacing from any row" in done.output
+    vines = gpd.read_file(paths.geopackage(tmp_path / "out", "A"), layer="vines")
+    assert vines.groupby("row_id").size().tolist() == vineyard.rows["n_vines"].tolist()
+    assert (vines["position_sd_m"] < 0.05).all()
+    assert shapely.distance(shapely.force_2d(vines.geometry.to_numpy()), points).max() < 0.12
+    gone = shapely.force_2d(vines.geometry[vines["state"] == "missing"].to_numpy())
+    dead = vineyard.dead_vines.geometry.to_numpy()
+    assert len(gone) == len(dead)
+    assert shapely.distance(gone[:, None], dead).min(axis=0).max() < 0.15
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert [one["file"] for one in record["inputs"]][1:] == ["planted.gpkg"] * 2
+
+
 def test_rasters(product):
     for kind in RASTERS:
         with rasterio.open(paths.raster(product.folder, "A", kind)) as src:

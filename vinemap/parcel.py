@@ -24,6 +24,7 @@ from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.evaluate.shift import Shift, measure_shift
+from vinemap.evaluate.trunks import vines_in_rows
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.crs import project
@@ -178,6 +179,7 @@ def map_parcel(
     origin: Origin | None = None,
     rows: Path | None = None,
     rows_crs: CRS | None = None,
+    vines: Path | None = None,
     step: Callable[..., Any] = call,
 ) -> Summary:
     """Map the rows and canopies of one parcel, and leave the product in a folder.
@@ -202,6 +204,8 @@ def map_parcel(
         Origin of {Main}; by default the south-western corner of the parcel at its lowest terrain.
     rows, rows_crs : Path, CRS, optional
         Known rows, which aren't sought, as of :func:`vinemap.geo.lines.read_rows`.
+    vines : Path, optional
+        Points of known vines, whose places aren't estimated.
     step : callable
         Runs a stage, as ``step(name, function, *args, **kwargs)`` with a name of ``STAGES``.
 
@@ -213,7 +217,8 @@ def map_parcel(
     name = check_parcel(parcel)
     if settings:
         check_engine(settings.ground.engine)
-    given: dict[str, Any] = {"boundary": boundary, "crs": crs, "origin": origin, "rows": rows, "rows_crs": rows_crs}
+    given: dict[str, Any] = {"boundary": boundary, "crs": crs, "origin": origin}
+    given |= {"rows": rows, "rows_crs": rows_crs, "vines": vines}
     recipe = recipe_of(cloud, parcel=name, named=named, settings=settings, **given)
     return follow(recipe, folder, step=step)
 
@@ -268,7 +273,8 @@ def follow(
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
-        given = settings.missing.model_dump() | {"step": apart}
+        standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
+        given = settings.missing.model_dump() | {"step": apart, "known": standing}
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, model.table, found.cover, **given)
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
         outlines = parcel_layer(parcel, rows, polygon, points)
@@ -294,7 +300,7 @@ def follow(
 
         run("Writing", write)
         about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
-        about |= {"remarks": found.remarks, "shift": shift}
+        about |= {"remarks": [*found.remarks, *strays], "shift": shift}
         record = record_of(recipe, found.cloud, layers, (found.dtm, found.chm), origin=main, **about)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
         record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)

@@ -8,6 +8,8 @@ import shapely
 
 from vinemap.canopy.numbers import lengths_of, summarise_rows
 from vinemap.evaluate.planting import Edges, estimate_spacing
+from vinemap.evaluate.shift import Shift
+from vinemap.evaluate.trunks import vines_in_rows
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.raster import Raster, grid_over
 from vinemap.parcel import map_rows, model_canopies
@@ -157,6 +159,53 @@ def test_canopies_of_vines_add_up_to_their_rows_and_weak_ones_are_told():
     assert (gone["volume_m3"] == 0).all()
     assert gone["height_m"].isna().all()
     assert out["n_missing"].sum() == len(gone)
+
+
+def surveyed(rows, *, shift=(0.0, 0.0)):
+    """Points of vines to 2 cm, of missing ones too, in any order and another CRS."""
+    rng = np.random.default_rng(0)
+    xy = np.concatenate([np.column_stack([2 + place, np.full(len(place), north)]) for north, place, *_ in rows])
+    xy = rng.permutation(xy) + rng.normal(0, 0.02, xy.shape) + shift
+    return gpd.GeoSeries(shapely.points(xy + [500_000, 5_000_000]), crs=32632).to_crs(4326)
+
+
+def at_home(told):
+    """Tables at a place on the globe, with the rows' distance."""
+    rows, gaps, sections, cover = told
+    place = 500_000, 5_000_000
+    grid = cover.grid._replace(west=cover.grid.west + place[0], north=cover.grid.north + place[1])
+    rows = rows.set_geometry(rows.translate(*place)).assign(spacing_m=ROWS_APART)
+    return rows, gaps, sections, Raster(cover.values, grid, None)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -0.2)])
+def test_known_vines_stand_where_they_are_known_to(shift):
+    """In rows that tell nothing, and in some of several; those of others are estimated."""
+    rows = planted(1.2, rows=4, dead=0) + planted(1.2, south=4 * ROWS_APART, seed=1)
+    told = at_home(tables(rows))
+    off = Shift(-np.array(shift), np.eye(2), np.full(2, 0.01), 9, 9)
+    known, remarks = vines_in_rows(surveyed(rows[:6], shift=shift), told[0], off)
+    assert (sorted(known), remarks) == ([*range(6)], [])
+    out, gaps, vines = find_vines(*told, known=known)
+    compared(vines[vines["row_id"] <= 6], rows[:6], within=0.08)
+    compared(vines[vines["row_id"] > 6].assign(row_id=lambda table: table["row_id"] - 6), rows[6:], within=0.2)
+    assert (vines["position_sd_m"] < 0.05).to_numpy().tolist() == (vines["row_id"] <= 6).tolist()
+    assert out["n_missing"].tolist() == [gone.sum() for _, _, gone, *_ in rows]
+    assert gaps["n_missing"].sum() == out["n_missing"].sum()
+    assert (vines.loc[vines["state"] == "vine", "volume_m3"] > 0).all()
+
+
+def test_known_vines_that_stand_in_no_row_are_told():
+    rows = planted(1.2)
+    told = at_home(tables(rows))
+    (north, place, *_), far = rows[0], planted(1.2, rows=1, south=-1.4)
+    known, remarks = vines_in_rows(surveyed([*rows, *far, (north, place[-1:] + [0.7, 1.9], 0)]), told[0])
+    assert sum(map(len, known.values())) == sum(len(place) for _, place, *_ in rows) + 1
+    lost, n = len(far[0][1]) + 1, sum(len(one[1]) for one in (*rows, *far)) + 2
+    words = "known vines stand farther than half a spacing from any row, or beyond its ends, and are left out"
+    assert remarks == [f"{lost} of {n} {words}"]
+    assert vines_in_rows(surveyed(rows), told[0][:0])[0] == {}
+    assert vines_in_rows(None, told[0]) == ({}, [])
 
 
 def test_a_parcel_without_rows_has_no_vines():

@@ -12,6 +12,7 @@ from pyproj import CRS
 
 from vinemap.errors import InputError
 from vinemap.geo.crs import LOCAL
+from vinemap.geo.layers import read_points
 from vinemap.geo.lines import read_rows, rows_of
 
 UTM = CRS.from_epsg(32632)
@@ -77,6 +78,22 @@ def test_the_layer_of_a_product(tmp_path):
     write(tmp_path / "two.gpkg", layer="b")
     with pytest.raises(InputError, match=r"any of its layers may be meant \(a, b\)"):
         read_rows(tmp_path / "two.gpkg")
+
+
+def test_points_of_vines(tmp_path):
+    """Of the layer that is called so, else of the only one of points; each counts once."""
+    points = [shapely.Point(1, 2), shapely.MultiPoint([(3, 4), (1, 2)]), shapely.Point(5, 6)]
+    path = write(write(tmp_path / "F.gpkg", layer="rows"), points, layer="surveyed")
+    found = read_points(path, "vines")
+    assert found.crs == UTM
+    assert found.get_coordinates().to_numpy().tolist() == [[1, 2], [3, 4], [5, 6]]
+    write(path, points[:1], layer="posts")
+    with pytest.raises(InputError, match=r"may be meant \(rows, surveyed, posts\): name that of the vines so"):
+        read_points(path, "vines")
+    write(path, points[2:], layer="vines")
+    assert read_points(path, "vines").get_coordinates().to_numpy().tolist() == [[5, 6]]
+    with pytest.raises(InputError, match="holds no point: vines are points, one each"):
+        read_points(write(tmp_path / "lines.gpkg"), "vines")
 
 
 @pytest.mark.parametrize(

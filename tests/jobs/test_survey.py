@@ -12,6 +12,7 @@ import time
 import geopandas as gpd
 import numpy as np
 import pytest
+import shapely
 from commands import assert_refused, vinemap
 from products import SURVEYS, content, many, tree
 from systems import POSIX
@@ -91,6 +92,21 @@ def test_what_is_wrong_with_a_parcel_is_its_own(mapped, boundaries):
     assert "three.laz: no point lies inside the boundary" in outcomes["empty"].reason
     assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS[:2], "inner A", *SURVEYS[2:]]
     assert [path.name for path in folder.parent.iterdir()] == ["products"]
+
+
+def test_known_vines_are_their_parcels(three, cloud, tmp_path):
+    polygons = gpd.read_file(cloud.with_name("parcels.gpkg"))
+    at = polygons.set_index("name").representative_point()
+    points = gpd.GeoSeries([at["A"], at["B"], at["B"], shapely.Point(0, 0)], crs=polygons.crs)
+    points.to_crs(4326).to_file(tmp_path / "v.geojson")
+    how = {"survey": "three", "cloud": cloud, "boundaries": cloud.with_name("parcels.gpkg")}
+    plan = plan_survey(survey_config(**how, vines=tmp_path / "v.geojson"), tmp_path / "products")
+    assert {recipe.parcel: len(recipe.vines) for recipe in plan.recipes} == {"A": 1, "B": 1, "C": 0}
+    (left,) = plan.settled
+    assert (left.state, left.reason) == (LEFT, "v.geojson: 1 of 3 known vines stand in no parcel")
+    without = plan_survey(survey_config(**how), tmp_path / "products").recipes
+    same = [one.parcel for one, other in zip(plan.recipes, without, strict=True) if one.key == other.key]
+    assert same == ["C"]
 
 
 def test_known_rows_are_their_parcels(three, cloud, tmp_path):

@@ -121,6 +121,24 @@ def test_known_rows_of_the_parcel_are_in_the_key(made, cloud, boundaries, tmp_pa
         key([last], [8])
 
 
+def test_known_vines_of_the_parcel_are_in_the_key(made, cloud, boundaries, tmp_path):
+    """Where they stand; what stands elsewhere isn't, and is no reason to fail unless all do."""
+    x, y = PLACE
+
+    def key(places):
+        gpd.GeoDataFrame(geometry=gpd.points_from_xy(*np.transpose(places)), crs=32632).to_file(tmp_path / "v.gpkg")
+        recipe = recipe_of(cloud, parcel="A", boundary=boundaries, vines=tmp_path / "v.gpkg")
+        assert recipe.sources[-1].path == tmp_path / "v.gpkg"
+        return recipe.key
+
+    inside = [(x + 1, y + 2), (x + 2, y + 2)]
+    alone = key(inside)
+    assert key([*inside, (x + 500, y)]) == alone
+    assert len({made.key, alone, key(inside[:1])}) == 3
+    with pytest.raises(InputError, match=r"none of its vines stands in the parcel: is its CRS the right one\?"):
+        key([(x + 500, y)])
+
+
 def test_the_key_tells_nothing_else(made, cloud, boundaries, tmp_path):
     """A file touched, renamed, beside others; polygons beside it, in another order, drawn from another corner."""
     os.utime(cloud, (1, 1))

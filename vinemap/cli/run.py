@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 @click.option(
     "--rows", type=FILE, help="Known rows, as lines or posts: measured, none sought. The same formats, and DXF."
 )
-@click.option("--rows-crs", help="CRS of the known rows, as EPSG:n, where their file states none.")
+@click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
+@click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--parcel", help="Name of the parcel; the cloud's by default.")
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
@@ -37,6 +38,7 @@ def run(
     boundary: Path | None,
     rows: Path | None,
     rows_crs: str | None,
+    vines: Path | None,
     crs: str | None,
     parcel: str | None,
     out: Path | None,
@@ -64,6 +66,7 @@ def run(
         "boundary": boundary,
         "rows": rows,
         "rows_crs": parse_crs(rows_crs) if rows_crs else None,
+        "vines": vines,
         "origin": origin,
         "named": parcel is not None,
     }

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 @click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
 @click.option("--boundaries", type=FILE, required=True, help="Polygons of the parcels, named in one of their columns.")
 @click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")
-@click.option("--rows-crs", help="CRS of the known rows, as EPSG:n, where their file states none.")
+@click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
+@click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
 @click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
@@ -34,6 +35,7 @@ def survey(
     boundaries: Path,
     rows: Path | None,
     rows_crs: str | None,
+    vines: Path | None,
     parcels: tuple[str, ...],
     crs: str | None,
     out: Path | None,
@@ -56,6 +58,7 @@ def survey(
         boundaries=boundaries,
         rows=rows,
         rows_crs=rows_crs,
+        vines=vines,
         parcels=list(parcels) or None,
         crs=crs,
         origin=origin,

@@ -51,8 +51,9 @@ class _Surveys(Options):
     boundaries: Path | None = Field(None, description="polygons of the parcels, named in one of their columns")
     rows: Path | None = Field(None, description="known rows: lines, or posts of one name; none: rows are sought")
     rows_crs: Annotated[str, checked_by(parse_crs)] | None = Field(
-        None, description="CRS of the known rows, as EPSG:n, where their file states none"
+        None, description="CRS of the known rows and vines, as EPSG:n, where their file states none"
     )
+    vines: Path | None = Field(None, description="known vines: points, one each; none: where they stand is estimated")
     parcels: list[ParcelName] | None = Field(
         None, min_length=1, description="names of the parcels; none: all that there are"
     )
@@ -128,7 +129,9 @@ class EstateConfig(_Surveys):
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
-            stated |= {key: _beside(own, stated[key]) for key in ("cloud", "boundaries", "rows") if stated.get(key)}
+            stated |= {
+                key: _beside(own, stated[key]) for key in ("cloud", "boundaries", "rows", "vines") if stated.get(key)
+            }
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}

@@ -12,12 +12,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from vinemap.canopy.numbers import lengths_of
 from vinemap.evaluate.planting import Edges, estimate_extent, estimate_spacing, place_vines
+from vinemap.evaluate.trunks import known_spacing, with_known
 from vinemap.geo.curve import at, tangents
 from vinemap.geo.raster import sample_across
 from vinemap.rows.ends import MISSING, UNSEEN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
@@ -58,6 +59,7 @@ def find_vines(
     *,
     vine_spacing: float | None = None,
     step: float = 0.25,
+    known: Mapping[int, Values] | None = None,
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame, gpd.GeoDataFrame]:
     """Place the vines of rows, and tell which are missing.
 
@@ -75,6 +77,9 @@ def find_vines(
         Metres between vines in a row; by default estimated, block by block.
     step : float
         Metres between sections.
+    known : mapping of int to array, optional
+        Where all vines of some rows are known to stand, by the rows' positions in the table: metres along them, in
+        order.
 
     Returns
     -------
@@ -90,13 +95,15 @@ def find_vines(
     members = [np.flatnonzero(block == one) for one in np.unique(block)]
     stands = [_stands(rows.iloc[own], [unseen[k] for k in own], sections, cover, step) for own in members]
     edges = [[stand.edges for stand in part] for part in stands]
-    usual = vine_spacing or estimate_spacing([row for part in edges for row in part])
+    known = known or {}
+    usual = vine_spacing or known_spacing(known.values()) or estimate_spacing([row for part in edges for row in part])
     spacing = rows["vine_spacing_m"].to_numpy(dtype=float, copy=True)
     tables = [pd.DataFrame(columns=["row", "position_m", "position_sd_m", "bare", "block"], dtype=float)]
     for own, part, told in zip(members, stands, edges, strict=True):
-        if apart := vine_spacing or estimate_spacing(told) or usual:
+        given = {k: known[one] for k, one in enumerate(own.tolist()) if one in known}
+        if apart := vine_spacing or known_spacing(given.values()) or estimate_spacing(told) or usual:
             extent = estimate_extent(told, apart)
-            row, position, deviation = place_vines(told, apart, extent)
+            row, position, deviation = with_known(place_vines(told, apart, extent), given)
             bare = _bare(part, row, position, CORE * min(extent, apart))
             columns = own[row], position, deviation, bare, np.full(len(row), block[own[0]])
             tables.append(pd.DataFrame(dict(zip(tables[0].columns, columns, strict=True))))

@@ -7,12 +7,13 @@ import zipfile
 from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
+import numpy as np
 import pandas as pd
 import pyogrio
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import LOCAL, WGS84, is_local
+from vinemap.geo.crs import LOCAL, WGS84, is_local, project
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -99,6 +100,43 @@ def read_layers(
         ways = "save it with its CRS, give it with --rows-crs," if drawn else "save it with its CRS,"
         raise InputError(f"{path}: has no geometry or no CRS: {ways} or say --crs local of local ones")
     return frame
+
+
+def read_points(path: Path, things: str, *, crs: CRS | None = None, local: bool = False) -> gpd.GeoSeries:
+    """Read points in plan, each once: those of the layer that is called as they are, or of the only one of points.
+
+    Parameters are as of :func:`read_layers`.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read, has no CRS or no point, or more than one layer that may be meant.
+    """
+
+    def choose(layers: Sequence[Layer]) -> Sequence[Layer]:
+        named = [layer for layer in layers if layer.name.lower() == things]
+        points = [layer for layer in layers if "Point" in layer.kind]
+        if named or len(points) == 1:
+            return named or points
+        if len(layers) > 1 and path.suffix.lower() not in KML:
+            names = ", ".join(layer.name for layer in layers)
+            raise InputError(f"{path}: any of its layers may be meant ({names}): name that of the {things} so")
+        return layers
+
+    table = read_layers(path, choose, things, drawn=True, crs=crs, local=local)
+    parts = [part for shape in table.geometry for part in parts_of(shape) if isinstance(part, shapely.Point)]
+    xy = shapely.get_coordinates(parts)
+    xy = xy[np.sort(np.unique(xy, axis=0, return_index=True)[1])]
+    xy = xy[np.isfinite(xy).all(axis=1)]
+    if len(xy) == 0:
+        raise InputError(f"{path}: holds no point: {things} are points, one each")
+    return gpd.GeoSeries(shapely.points(xy), crs=table.crs)
+
+
+def points_near(points: gpd.GeoSeries, polygon: shapely.Geometry, crs: CRS, *, reach: float) -> gpd.GeoSeries:
+    """Those of some points that lie in a polygon, or within metres of it; the polygon's CRS is given."""
+    brought = project(points.to_numpy(), points.crs, crs)
+    return points[shapely.dwithin(brought, polygon, reach)]
 
 
 def _layers(path: Path, things: str) -> list[Layer]:

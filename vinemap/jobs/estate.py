@@ -174,7 +174,7 @@ def _config(name: str, path: Path, found: _Found, estate: EstateConfig) -> Surve
 def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConfig, now: float) -> Arrival:
     """A survey, if its files have stayed as they are, and are there to their ends."""
     clouds = cloud_files(config.cloud or ())
-    used = [p for p in (*clouds, config.boundaries, config.rows, own) if p]
+    used = [p for p in (*clouds, config.boundaries, config.rows, config.vines, own) if p]
     for file in used:
         _check(file)
     age = now - max(p.stat().st_mtime for p in used)

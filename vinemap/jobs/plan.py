@@ -13,14 +13,16 @@ from vinemap.config.names import check_parcel
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
-from vinemap.geo.layers import some_of
+from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.lines import KnownRows, read_rows, rows_of
-from vinemap.product.recipe import Recipe, Source, flown, product_in, read_clouds, read_source
+from vinemap.product.recipe import VINES, Recipe, Source, flown, product_in, read_clouds, read_source, vines_of
 from vinemap.product.record import in_words
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+
+    import geopandas as gpd
 
     from vinemap.config.surveys import SurveyConfig
 
@@ -100,10 +102,11 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     else:
         sources = *clouds, read_source(boundaries, hashed)
         polygons = {**read_parcels(boundaries, config.parcels, local=local)}
-    sources += (read_source(config.rows, hashed),) if config.rows else ()
+    sources += tuple(read_source(path, hashed) for path in (config.rows, config.vines) if path)
     rows, lost = _known_rows(config, polygons, local=local)
+    vines, strays = _known_vines(config, polygons, local=local)
     files, date = tuple(source.path for source in clouds), min(map(flown, clouds))
-    plan = Plan(sources, date, [], lost, listed)
+    plan = Plan(sources, date, [], [*lost, *strays], listed)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
     taken: dict[str, str] = {}
@@ -137,6 +140,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             survey=config.survey,
             remarks=remarks,
             known=rows.get(name),
+            vines=vines.get(name),
         )
         key = recipe.key
         product = None if again else product_in(place)
@@ -164,6 +168,23 @@ def _known_rows(
         return known, []
     reason = f"{path.name}: {len(homeless)} of {len(rows.lines)} known rows lie in no parcel: {some_of(homeless)}"
     return known, [Outcome("known rows", LEFT, reason=reason)]
+
+
+def _known_vines(
+    config: SurveyConfig, polygons: Mapping[str, Parcel | InputError | None], *, local: bool
+) -> tuple[dict[str, gpd.GeoSeries], list[Outcome]]:
+    """Points of the known vines of each parcel, and what becomes of those that stand in none."""
+    path = config.vines
+    if path is None:
+        return {}, []
+    points = read_points(path, VINES, crs=parse_crs(config.rows_crs) if config.rows_crs else None, local=local)
+    parcels = {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
+    known = {name: vines_of(points, boundary) for name, boundary in parcels.items()}
+    homeless = len(points) - len(set().union(*(own.index for own in known.values())))
+    if not homeless or (homeless < len(points) and config.parcels is not None):
+        return known, []
+    reason = f"{path.name}: {homeless} of {len(points)} known vines stand in no parcel"
+    return known, [Outcome("known vines", LEFT, reason=reason)]
 
 
 def _earlier(folder: Path) -> _Earlier:

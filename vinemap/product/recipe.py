@@ -17,19 +17,24 @@ from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import read_parcel
 from vinemap.geo.crs import is_local
-from vinemap.geo.layers import some_of
+from vinemap.geo.layers import points_near, read_points, some_of
 from vinemap.geo.lines import read_rows, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    import geopandas as gpd
     from pyproj import CRS
 
     from vinemap.geo.boundaries import Boundary
     from vinemap.geo.lines import KnownRows
     from vinemap.geo.main import Origin
 
+VINES = "vines"
+"""Layer of known vines."""
+BESIDE = 0.5
+"""Metres beside a parcel at which its vines may stand."""
 SETTLED = 2.0
 """Seconds within which a file can change twice without its time telling."""
 
@@ -134,6 +139,8 @@ class Recipe(NamedTuple):
     """What is to be known of the boundary: a sentence each."""
     known: KnownRows | None = None
     """Its rows, where they are known."""
+    vines: gpd.GeoSeries | None = None
+    """Points of its vines, where they are known."""
 
     @property
     def flights(self) -> tuple[Source, ...]:
@@ -166,6 +173,8 @@ class Recipe(NamedTuple):
             lines = self.known.lines
             shapes = shapely.to_wkb(lines.geometry.to_numpy(), hex=True).tolist()
             parts["rows"] = lines.crs.to_string(), lines["row_id"].tolist(), lines["label"].tolist(), shapes
+        if self.vines is not None and len(self.vines):
+            parts["vines"] = self.vines.crs.to_string(), self.vines.get_coordinates().to_numpy().tolist()
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -199,6 +208,7 @@ def recipe_of(
     survey: str | None = None,
     rows: Path | None = None,
     rows_crs: CRS | None = None,
+    vines: Path | None = None,
 ) -> Recipe:
     """Gather what the product of one parcel depends on, as :func:`vinemap.parcel.map_parcel` is told.
 
@@ -210,7 +220,7 @@ def recipe_of(
     Raises
     ------
     InputError
-        If the cloud, the boundary or the rows can't be read, or none of the rows lies in the parcel.
+        If the cloud, the boundary, the rows or the vines can't be read, or none of these lies in the parcel.
     """
     local = crs is not None and is_local(crs)
     # A product's name by default says nothing of a polygon.
@@ -229,7 +239,19 @@ def recipe_of(
         if outside:
             left = f"{len(outside)} known rows lie outside of the parcel, and are left out: {some_of(outside)}"
             remarks += (left,)
-    return Recipe(parcel, files, sources, polygon, settings or Settings(), crs, origin, date, survey, remarks, known)
+    points = None
+    if vines:
+        sources += (read_source(vines),)
+        points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), polygon)
+        if len(points) == 0:
+            raise InputError(f"{vines}: none of its vines stands in the parcel: is its CRS the right one?")
+    given = settings or Settings(), crs, origin, date, survey, remarks, known, points
+    return Recipe(parcel, files, sources, polygon, *given)
+
+
+def vines_of(points: gpd.GeoSeries, boundary: Boundary | None) -> gpd.GeoSeries:
+    """Those of known vines that stand in a parcel, or just beside it, as its boundary may follow its outermost row."""
+    return points_near(points, *boundary, reach=BESIDE) if boundary else points
 
 
 def flown(cloud: Source) -> datetime:
