@@ -70,6 +70,7 @@ RECORD = (
     "origin",
     "counts",
     "modelling",
+    "shift",
     "warnings",
     "versions",
 )

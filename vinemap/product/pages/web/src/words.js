@@ -60,7 +60,15 @@ export function showUnmapped({ unmapped }) {
     `${reason}, ${plural(n, "place")}, ${number(area)} m² (${number(100 * share, 1)}% of the parcel)`).join("; "), ".");
 }
 
-export function showRecord({ inputs, settings, versions, vinemap, crs, vertical_datum, origin, flown, counts }) {
+/** How far the flight lies off known rows, in the directions in which that is told. */
+function offKnownRows({ east_m, north_m, east_sd_m, north_sd_m, axes: [best, worst] }) {
+  const metres = (value, sd) => `${number(value, 2)} ± ${number(sd, 2)} m`;
+  if (worst.sd_m === null)
+    return `the flight lies ${metres(best.m, best.sd_m)} off them towards ${number(best.deg)}° (anticlockwise from east); along the rows nothing tells it`;
+  return `the flight lies ${number(Math.hypot(east_m, north_m), 2)} m off them: ${metres(east_m, east_sd_m)} to the east, ${metres(north_m, north_sd_m)} to the north`;
+}
+
+export function showRecord({ inputs, settings, versions, vinemap, crs, vertical_datum, origin, flown, counts, shift }) {
   const line = (term, ...shown) => element("div", {}, element("dt", {}, term), element("dd", {}, ...shown));
   const code = (text) => element("code", {}, text);
   const files = (inputs ?? []).flatMap((input) => [
@@ -74,6 +82,7 @@ export function showRecord({ inputs, settings, versions, vinemap, crs, vertical_
       line("Coordinate system", crs ?? "–"),
       line("Heights", vertical_datum ?? "the cloud’s own vertical datum, which it doesn’t name"),
       origin ? line("Origin of {Main}", `${number(origin.lat, 9)}° N, ${number(origin.lon, 9)}° E, ${number(origin.alt, 3)} m`) : null,
+      shift ? line("Known rows", offKnownRows(shift), settings?.rows?.align ? ", and was moved onto them" : "") : null,
       line("Flown", flown ? day(flown) : "–")),
     element("h3", {}, "Inputs"), element("dl", {}, ...files),
     element("h3", {}, "Settings"), element("dl", {}, ...stages),
