@@ -204,6 +204,10 @@ def test_known_vines_that_stand_in_no_row_are_told():
     lost, n = len(far[0][1]) + 1, sum(len(one[1]) for one in (*rows, *far)) + 2
     words = "known vines stand farther than half a spacing from any row, or beyond its ends, and are left out"
     assert remarks == [f"{lost} of {n} {words}"]
+    _, remarks = vines_in_rows(surveyed(rows, shift=(0, 0.8)), told[0])
+    assert [remark.split(",")[0] for remark in remarks] == [
+        "half of the known vines stand 0.80 m or more aside of their rows"
+    ]
     assert vines_in_rows(surveyed(rows), told[0][:0])[0] == {}
     assert vines_in_rows(None, told[0]) == ({}, [])
 

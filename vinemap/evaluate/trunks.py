@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 USUAL = 2.5
 """Metres between rows that are taken where there is but one."""
+ASIDE = 0.2
+"""Spacings by which most known vines may stand aside of their rows before these are doubtful."""
 SURVEYED = 0.02
 """Metres, a standard deviation, by which a surveyed vine is off."""
 
@@ -46,7 +48,8 @@ def vines_in_rows(
     vines : dict of int to array
         By the rows' positions in the table: metres along them, in order.
     remarks : list of str
-        How many stand in none: half a spacing or farther aside, or half a vine's distance beyond its ends.
+        How many stand in none: half a spacing or farther aside, or half a vine's distance beyond its ends. That most
+        are so far aside that their rows may be others.
     """
     if points is None or len(points) == 0 or len(rows) == 0:
         return {}, []
@@ -54,17 +57,21 @@ def vines_in_rows(
     xy = xy + shift.metres if shift else xy
     row, position, beyond, away = _places(xy, shapely.force_2d(rows.geometry.to_numpy()))
     spacing = rows["spacing_m"].to_numpy(dtype=float)
-    stands = away <= np.where(np.isfinite(spacing), spacing, USUAL)[row] / 2
+    share = away / np.where(np.isfinite(spacing), spacing, USUAL)[row]
+    stands = share <= 0.5
     near = {k: np.sort(position[stands & (row == k)]) for k in np.unique(row[stands]).tolist()}
     apart = known_spacing(near.values())
     stands &= beyond <= (apart or 0.0) / 2
     vines = {k: np.sort(position[stands & (row == k)]) for k in np.unique(row[stands]).tolist()}
     lost = len(xy) - int(stands.sum())
-    remark = (
+    off = float(np.median(away[stands])) if stands.any() else 0.0
+    remarks = {
         f"{lost} of {len(xy)} known vines stand farther than half a spacing from any row, or beyond its ends, and are "
-        "left out"
-    )
-    return vines, [remark] if lost else []
+        "left out": lost > 0,
+        f"half of the known vines stand {off:.2f} m or more aside of their rows, and may be the next rows'; give known "
+        "rows from the same survey (--rows), or look whether the CRS is right": bool(np.median(share) > ASIDE),
+    }
+    return vines, [remark for remark, holds in remarks.items() if holds]
 
 
 def _places(xy: Values, lines: Lines) -> tuple[Ints, Values, Values, Values]:
