@@ -92,10 +92,14 @@ def test_a_row_that_was_taken_for_another_does_not_count():
     assert wrong.rows == told.rows - 1
 
 
-def test_a_large_shift_is_a_warning():
-    rows = gpd.GeoDataFrame({"spacing_m": [2.5, 2.5]})
-    assert shift_notices(measure(straight(5)), rows) == shift_notices(None, rows) == []
-    (remark,) = shift_notices(measure(straight(5), shift=np.array([0.2, 1.1])), rows)
+def test_a_large_shift_across_rows_is_a_warning():
+    """Along rows it takes none for the next."""
+    courses = straight(5)
+    rows = gpd.GeoDataFrame({"spacing_m": [2.5] * 5}, geometry=[shapely.LineString(xy) for xy in courses])
+    way = np.diff(courses[0], axis=0)[0] / np.hypot(*np.diff(courses[0], axis=0)[0])
+    along, across = 1.1 * way, 1.1 * np.array([-way[1], way[0]])
+    assert shift_notices(measure(courses, shift=along), rows) == shift_notices(None, rows) == []
+    (remark,) = shift_notices(measure(courses, shift=along + across), rows)
     assert remark.startswith("the flight lies 1.1")
 
 

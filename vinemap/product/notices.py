@@ -81,20 +81,25 @@ def notices(
 
 
 def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
-    """That a flight lies so far off known rows that each may be taken for the next.
+    """That a flight lies so far aside of known rows that each may be taken for the next.
 
     Parameters
     ----------
     shift : Shift or None
         How far it lies off.
     rows : GeoDataFrame
-        With ``spacing_m``.
+        LineString with ``spacing_m``.
     """
-    if shift is None or shift.length <= ASIDE * float(rows["spacing_m"].median()):
+    if shift is None:
+        return []
+    chords = np.array([np.subtract(*shapely.get_coordinates(line)[[-1, 0]]) for line in rows.geometry])
+    along = chords / np.linalg.norm(chords, axis=1)[:, None]
+    aside = np.abs(along[:, 0] * shift.metres[1] - along[:, 1] * shift.metres[0])
+    if not (aside > ASIDE * rows["spacing_m"]).any():
         return []
     remark = (
-        f"the flight lies {shift.length:.2f} m off the known rows, almost half of their distance or more: a row may "
-        "have been taken for the next; see that both have the right CRS and the same base station"
+        f"the flight lies {aside.max():.2f} m aside of the known rows, almost half of their distance or more: a row "
+        "may have been taken for the next; see that both have the right CRS and the same base station"
     )
     return [remark]
 
