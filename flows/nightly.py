@@ -23,6 +23,7 @@ from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.jobs.estate import Arrival, arrivals
 from vinemap.jobs.plan import FAILED, Outcome, plan_survey
+from vinemap.jobs.register import is_due
 from vinemap.jobs.survey import map_survey
 
 PASSED = "passed over"
@@ -87,6 +88,7 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
             outcomes = outcomes_of(config, folder)
         else:  # what had to be read for that need not be read again
             read = any(source.read >= began for source in plan.sources)
+            read |= bool(is_due(plan.register) or plan.due(plan.settled))
             outcomes = list(map_survey(config, folder)) if read else plan.settled
     except BusyError as error:
         return Night(arrival.name, [], str(error))

@@ -19,6 +19,7 @@ from vinemap.cloud.pdal import check_engine
 from vinemap.config.surveys import SurveyConfig, choose_parcel, load_survey
 from vinemap.errors import ConfigError, InputError
 from vinemap.geo.crs import parse_crs
+from vinemap.jobs.register import known_of
 from vinemap.parcel import follow
 from vinemap.product.recipe import recipe_of
 from vinemap.simulate.scenes import barolo
@@ -55,6 +56,9 @@ def parcel_flow(survey: str, parcel: str, config: SurveyConfig) -> Summary:
         vines=config.vines,
         **dict(config.of_parcel(parcel)),
     )
+    known = None if config.rows else known_of(config, recipe.flown, {parcel: recipe.boundary})
+    if known:
+        recipe = recipe._replace(known=known.rows.get(parcel))
     products = paths.survey_products(survey)
     with progress(parcel) as show:
         return follow(recipe, paths.parcel_folder(products, parcel), within=products, step=as_tasks(show))

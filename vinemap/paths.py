@@ -25,6 +25,8 @@ RUN = "run.json"
 INDEX = "index.html"
 ESTATE = Path("configs/nightly.yaml")
 """Configuration of the estate whose surveys come night after night."""
+REGISTER = DATA / "register.gpkg"
+"""Register of the estate's rows, where nobody names another."""
 OWN_CONFIGURATION = "survey.yaml"
 """File in a survey's folder that says what is otherwise in it."""
 TRACK = Path("track.gpkg")

@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.product.notices import height_notices, notices, sight_notices
+from vinemap.product.notices import height_notices, known_notices, notices, sight_notices
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
@@ -218,3 +218,25 @@ def test_what_was_not_seen_of_rows():
     ]
     assert sight_notices(some.assign(unseen_m=0.0), ends.assign(beyond="outside")) == []
     assert sight_notices(some[:0], ends[:0]) == []
+
+
+@pytest.mark.parametrize(
+    ("spacing", "shift", "some"),
+    [(2.5, 0.0, False), (2.5, 0.4, False), (2.2, 0.0, True), (2.2, 0.5, True), (2.8, -0.3, True)],
+)
+def test_rows_of_another_planting_are_told_from_a_shift(spacing, shift, some):
+    """Known lines are 2.5 m apart and of a little noise; rows of 2.2 m are others."""
+    noise = np.random.default_rng(1).normal(0, 0.05, 8)
+    lines = [shapely.LineString([(0, y), (20, y)]) for y in 2.5 * np.arange(8) + noise]
+    known = gpd.GeoDataFrame({"row_id": range(1, 9)}, geometry=lines, crs=32632).to_crs(3003)
+    places = spacing * (np.arange(-20, 40) - 10) + shift
+    nearest = [places[np.abs(places - 2.5 * k).argmin()] for k in range(8)]
+    seen = gpd.GeoDataFrame(
+        {"row_id": range(1, 9), "spacing_m": spacing, "support": 0.9},
+        geometry=[shapely.LineString([(0, y), (20, y)]) for y in nearest],
+        crs=32632,
+    )
+    said = known_notices(seen, known)
+    assert len(said) == some
+    assert not said or "of 8 rows stand 0." in said[0]
+    assert known_notices(seen.iloc[:2], known) == known_notices(seen.assign(support=0.0), known) == []

@@ -12,29 +12,39 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import shapely
 from drives import images, poses
+from products import place_product
 
 from vinemap.config.drives import Start
+from vinemap.jobs.register import register_products
 from vinemap.odometry.drive import map_drive
 from vinemap.parcel import map_parcel
+from vinemap.product.register.edits import settle
+from vinemap.product.register.file import Update, read_register, update_register
 from vinemap.simulate.camera import LOW
 from vinemap.simulate.survey import write_survey
 
-OPEN = Path(__file__).parents[1] / "open_in_qgis.py"
+OPEN, EDIT = (Path(__file__).parents[1] / f"{verb}_in_qgis.py" for verb in ("open", "edit"))
 PICTURES = Path(__file__).parents[2] / "build" / "qgis"
 PYTHONS = [os.environ.get("QGIS_PYTHON"), "/usr/bin/python3"]
 """Pythons that QGIS may be installed for, an own choice first."""
 
 
-def run(python, *args, folder):
+def environment(folder):
     (folder / "runtime").mkdir(mode=0o700, exist_ok=True)
     env = {"PATH": os.defpath, "HOME": str(folder), "LC_ALL": "C.UTF-8", "QT_QPA_PLATFORM": "offscreen"}
-    env |= {"XDG_RUNTIME_DIR": str(folder / "runtime")}
-    return subprocess.run([python, *map(str, args)], env=env, capture_output=True, text=True, check=False, timeout=120)
+    return env | {"XDG_RUNTIME_DIR": str(folder / "runtime")}
+
+
+def run(python, *args, folder):
+    words = [python, *map(str, args)]
+    return subprocess.run(words, env=environment(folder), capture_output=True, text=True, check=False, timeout=120)
 
 
 @pytest.fixture(scope="module")
-def open_in_qgis(tmp_path_factory):
+def qgis(tmp_path_factory):
+    """The Python that QGIS is installed for, and a home for it."""
     folder = tmp_path_factory.mktemp("home")
     found = (
         p for p in PYTHONS if p and Path(p).exists() and not run(p, "-c", "import qgis.core", folder=folder).returncode
@@ -42,6 +52,12 @@ def open_in_qgis(tmp_path_factory):
     python = next(found, None)
     if python is None:
         pytest.skip("needs QGIS for Python: apt-get install --no-install-recommends python3-qgis, or set QGIS_PYTHON")
+    return python, folder
+
+
+@pytest.fixture(scope="module")
+def open_in_qgis(qgis):
+    python, folder = qgis
     PICTURES.mkdir(parents=True, exist_ok=True)
 
     def opened(path, name, *page):
@@ -153,3 +169,43 @@ def test_a_track_opens_beside_the_rows(open_in_qgis, tmp_path):
         assert [c["label"] for c in layers["poses"]["classes"]] == ["measured", "flagged"]
         assert layers["poses"]["aliases"]["heading_deg"] == "Heading, clockwise from north (°)"
         assert layers["poses"]["n"] == 9
+
+
+def test_a_register_is_edited_while_it_is_written(qgis, open_in_qgis, tmp_path):
+    """In ten ways; the layer is open until the end."""
+    lines = np.array([shapely.LineString([(428000, 4940000 + 3 * k), (428030, 4940001 + 3 * k)]) for k in range(5)])
+    for name, north in (("F", 0), ("G", 100)):
+        there = [shapely.affinity.translate(line, yoff=north) for line in lines]
+        place_product(tmp_path / "june", name, np.array(there), survey="june", flown="2026-06-10")
+    path = tmp_path / "register.gpkg"
+    list(register_products([tmp_path / "june" / name for name in "FG"], path))
+    square = {"F": (shapely.box(427990, 4939990, 428040, 4940020), read_register(path).crs)}
+    python, folder = qgis
+    pipe = subprocess.PIPE
+    with subprocess.Popen([python, EDIT, path], env=environment(folder), stdin=pipe, stdout=pipe, text=True) as editor:
+        assert editor.stdout.readline() == "saved\n"
+        update_register(path, lambda register: Update(*settle(register, "2026-07-01", square)[:2]))
+        editor.stdin.close()
+    register = read_register(path)
+    assert sorted(zip(register.rows["uid"], register.rows["row_id"], register.rows["label"], strict=True)) == [
+        *((1, 1, "1 F"), (2, 2, "2 F"), (3, 3, "3 F"), (5, 5, "Barbera"), (6, 1, "1 G"), (7, 22, "2 G"), (8, 3, "3 G")),
+        *((9, 4, "4 G"), (10, 5, "5 G"), (11, 6, "6 F"), (12, 7, "7 F")),
+    ]
+    past = register.past.iloc[10:]
+    assert dict(zip(past["uid"], past["what"], strict=True)) == {
+        1: "moved by 2.00 m",
+        2: "moved by 0.30 m",
+        3: "moved by 9.00 m",
+        4: "removed",
+        5: "called Barbera",
+        6: "turned round",
+        7: "number 22",
+        10: "grubbed up 2026-06-20",
+        11: "split from 3 F",
+        12: "drawn",
+    }
+    seen = open_in_qgis(path, "register")
+    assert seen["errors"] == []
+    layers = {layer["name"]: layer for layer in seen["layers"]}
+    assert set(layers) == {"rows", "candidates", "history"}
+    assert all(layer["valid"] and layer["styled"] and layer["crs"] for layer in layers.values())

@@ -8,6 +8,7 @@ from vinemap import __version__
 from vinemap.cli.config import config
 from vinemap.cli.evaluate import evaluate
 from vinemap.cli.export import export
+from vinemap.cli.register import register
 from vinemap.cli.run import run
 from vinemap.cli.survey import survey
 from vinemap.cli.terminal import hushed, plain_errors
@@ -20,7 +21,7 @@ def commands() -> None:
     """Vine rows and light canopy meshes from UAV point clouds."""
 
 
-for command in (run, survey, config, evaluate, export, track):
+for command in (run, survey, register, config, evaluate, export, track):
     commands.add_command(command)
 
 

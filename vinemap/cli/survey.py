@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 @click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")
 @click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
 @click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
+@click.option(
+    "--register", "row_register", type=FILE, help="Register of known rows; data/register.gpkg, where that is there."
+)
 @click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
 @click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
@@ -36,6 +39,7 @@ def survey(
     rows: Path | None,
     rows_crs: str | None,
     vines: Path | None,
+    row_register: Path | None,
     parcels: tuple[str, ...],
     crs: str | None,
     out: Path | None,
@@ -59,6 +63,7 @@ def survey(
         rows=rows,
         rows_crs=rows_crs,
         vines=vines,
+        row_register=row_register,
         parcels=list(parcels) or None,
         crs=crs,
         origin=origin,

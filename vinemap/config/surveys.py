@@ -15,6 +15,8 @@ from vinemap.errors import ConfigError
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.main import Origin, check_origin
 
+FILES = ("cloud", "boundaries", "rows", "vines", "row_register")
+"""Keys of files, which in a survey's own file are named from its folder on."""
 MainOrigin = Annotated[Origin, checked_by(check_origin)]
 
 
@@ -54,6 +56,9 @@ class _Surveys(Options):
         None, description="CRS of the known rows and vines, as EPSG:n, where their file states none"
     )
     vines: Path | None = Field(None, description="known vines: points, one each; none: where they stand is estimated")
+    row_register: Path | None = Field(
+        None, description="register of known rows; none: data/register.gpkg, where that is there"
+    )
     parcels: list[ParcelName] | None = Field(
         None, min_length=1, description="names of the parcels; none: all that there are"
     )
@@ -129,9 +134,7 @@ class EstateConfig(_Surveys):
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
-            stated |= {
-                key: _beside(own, stated[key]) for key in ("cloud", "boundaries", "rows", "vines") if stated.get(key)
-            }
+            stated |= {key: _beside(own, stated[key]) for key in FILES if stated.get(key)}
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}

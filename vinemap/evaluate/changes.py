@@ -39,6 +39,8 @@ SHORTEST = 0.02
 """Metres that measurements of the shift scatter, at least."""
 WEAK = 0.2
 """Share of the best known direction's weight below which rows don't tell a shift in another direction."""
+ASIDE, MANY, FEWEST = 0.12, 0.25, 3
+"""Share of the spacing by which a row lies aside, share of such rows, and number of all, from which they are others."""
 TURNS = 8
 """Rounds in which measurements that don't fit lose their weight."""
 
@@ -172,6 +174,22 @@ def estimate_shift(
         weights = np.concatenate([np.ones(len(near[1])), np.full(len(offsets), _balance(near[1], offsets))])
         shift = shift + _solve(np.concatenate([near[0], directions]), np.concatenate([near[1], offsets]), weights)
     return shift
+
+
+def lie_aside(lines: Lines, before: Lines, *, spacing: float) -> NDArray[np.float64]:
+    """Metres (n,) by which rows lie off lines (n,) that they may be, but for a shift of all."""
+    if len(lines) == 0:
+        return np.zeros(0)
+    lines, before = shapely.force_2d(lines), shapely.force_2d(before)
+    moved = _move(lines, -estimate_shift(lines, before, spacing=spacing, width=spacing / 2))
+    places = shapely.line_interpolate_point(moved[:, None], [[0.25, 0.5, 0.75]], normalized=True)
+    off: NDArray[np.float64] = np.median(shapely.distance(places, before[:, None]), axis=1)
+    return off
+
+
+def are_others(off: NDArray[np.float64], *, spacing: float) -> bool:
+    """Whether rows that lie so many metres (n,) aside, each another way, are of another planting."""
+    return len(off) >= FEWEST and float(np.mean(off > ASIDE * spacing)) >= MANY
 
 
 def summarise(changes: Changes) -> dict[str, float]:

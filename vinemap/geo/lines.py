@@ -24,6 +24,7 @@ from vinemap.geo.layers import KML, Layer, kind_of, parts_of, read_layers, some_
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from numpy.typing import NDArray
     from pyproj import CRS
     from shapely.geometry.base import BaseGeometry
 
@@ -116,6 +117,15 @@ def _row_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
     raise InputError(f"{path}: any of its layers may be meant ({names}): name that of the rows {ROW_LAYER}")
 
 
+def as_rows(shapes: Sequence[BaseGeometry | None]) -> list[Row]:
+    """Lines of rows in plan, each once, or what there is instead of one, in words."""
+    given = np.array([*shapes, None], dtype=object)[:-1]
+    plain = (shapely.get_type_id(given) == shapely.GeometryType.LINESTRING) & shapely.is_simple(given)
+    plain &= (shapely.length(given) > 0) & np.isfinite(shapely.length(given)) & ~shapely.is_closed(given)
+    flat = shapely.remove_repeated_points(shapely.force_2d(given))
+    return _once([line if is_row else _as_row(line) for line, is_row in zip(flat.tolist(), plain, strict=True)])
+
+
 def _as_row(shape: BaseGeometry | None) -> Row:
     """The line of a row in plan, or what there is instead, in words."""
     parts = [shapely.force_2d(p) for p in parts_of(shape) if isinstance(p, shapely.LineString) and not p.is_empty]
@@ -199,8 +209,9 @@ def _through(posts: Floats) -> Row:
 def rows_of(known: KnownRows, parcels: Mapping[str, Boundary | None]) -> tuple[dict[str, KnownRows], list[str]]:
     """Known rows of each parcel in which there are some, and what those are called that lie in none.
 
-    A line belongs to the parcels that hold half of it. Rows without a number of their own get the next ones, and rows
-    without a name are called after their number and the parcel.
+    A line belongs to the parcels that hold half of it. If a column ``parcel`` names one of them, it is that one's
+    alone, and where nothing bounds a parcel, its name decides. Rows without a number of their own get the next ones,
+    and rows without a name are called after their number and the parcel.
 
     Parameters
     ----------
@@ -215,27 +226,33 @@ def rows_of(known: KnownRows, parcels: Mapping[str, Boundary | None]) -> tuple[d
         If nothing leads from the lines' CRS to a boundary's.
     """
     found, homeless = {}, np.ones(len(known.lines), dtype=bool)
+    held: dict[str, NDArray[np.intp]] = {}
+    owners = known.lines["parcel"].to_numpy() if "parcel" in known.lines else None
     brought: dict[CRS, shapely.STRtree] = {}
     for name, boundary in parcels.items():
-        inside = np.arange(len(known.lines))
+        inside = np.arange(len(known.lines)) if owners is None else np.flatnonzero(owners == name)
         if boundary:
             polygon, crs = boundary
             if crs not in brought:
                 brought[crs] = shapely.STRtree(project(known.lines.geometry.to_numpy(), known.lines.crs, crs))
             tree = brought[crs]
             near = np.sort(tree.query(polygon, predicate="intersects"))
-            held = shapely.length(shapely.intersection(tree.geometries[near], polygon))
-            inside = near[held >= INSIDE * shapely.length(tree.geometries[near])]
+            within = shapely.length(shapely.intersection(tree.geometries[near], polygon))
+            inside = near[within >= INSIDE * shapely.length(tree.geometries[near])]
         homeless[inside] = False
-        if len(inside):
-            found[name] = _complete(known.lines.iloc[inside].reset_index(drop=True), name, known.remarks)
-    return found, [_called(known.lines, k) for k in np.flatnonzero(homeless).tolist()]
+        held[name] = inside
+    for name, inside in held.items():
+        named = [name] * len(inside) if owners is None else owners[inside]
+        places = zip(inside.tolist(), named, strict=True)
+        if own := [k for k, owner in places if owner == name or k not in held.get(owner, ())]:
+            found[name] = _complete(known.lines.iloc[own].reset_index(drop=True), name, known.remarks)
+    return found, _called(known.lines, np.flatnonzero(homeless).tolist())
 
 
-def _called(lines: gpd.GeoDataFrame, k: int) -> str:
-    """What a line is called: by its name, its number, or its place in the file."""
-    number, label = lines["row_id"].iloc[k], lines["label"].iloc[k]
-    return label or (f"line {k + 1}" if pd.isna(number) else str(number))
+def _called(lines: gpd.GeoDataFrame, places: Sequence[int]) -> list[str]:
+    """What lines are called: by their names, their numbers, or their places in the file."""
+    numbers, labels = lines["row_id"].tolist(), lines["label"].tolist()
+    return [labels[k] or (f"line {k + 1}" if pd.isna(numbers[k]) else str(numbers[k])) for k in places]
 
 
 def _complete(lines: gpd.GeoDataFrame, parcel: str, remarks: tuple[str, ...]) -> KnownRows:

@@ -15,6 +15,7 @@ from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
 from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.lines import KnownRows, read_rows, rows_of
+from vinemap.jobs.register import Known, candidates_due, known_of
 from vinemap.product.recipe import VINES, Recipe, Source, flown, product_in, read_clouds, read_source, vines_of
 from vinemap.product.record import in_words
 from vinemap.product.store import write_whole
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.config.surveys import SurveyConfig
+    from vinemap.geo.boundaries import Boundary
 
 DONE, CURRENT, OUTSIDE, LEFT, FAILED = "done", "up to date", "not in the cloud", "left out", "failed"
 """What can become of a parcel."""
@@ -63,6 +65,13 @@ class Plan(NamedTuple):
     settled: list[Outcome]
     listed: bool
     """Whether somebody has named the parcels, so that each must be in the cloud."""
+    register: Known | None = None
+    """What the register says, where there is one."""
+
+    def due(self, outcomes: Iterable[Outcome]) -> list[str]:
+        """Parcels whose rows the register is to be offered, after what became of them."""
+        mapped = {one.parcel: one.state == DONE for one in outcomes if one.state in (DONE, CURRENT) and one.rows}
+        return candidates_due(self.register, self.flown, mapped)
 
 
 class _Earlier(NamedTuple):
@@ -106,7 +115,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     rows, lost = _known_rows(config, polygons, local=local)
     vines, strays = _known_vines(config, polygons, local=local)
     files, date = tuple(source.path for source in clouds), min(map(flown, clouds))
-    plan = Plan(sources, date, [], [*lost, *strays], listed)
+    register = _registered(config, date, polygons, rows, lost)
+    plan = Plan(sources, date, [], [*lost, *strays], listed, register)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
     taken: dict[str, str] = {}
@@ -162,8 +172,7 @@ def _known_rows(
     if path is None:
         return {}, []
     rows = read_rows(path, crs=parse_crs(config.rows_crs) if config.rows_crs else None, local=local)
-    parcels = {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
-    known, homeless = rows_of(rows, parcels)
+    known, homeless = rows_of(rows, _bounds(polygons))
     if not homeless or (known and config.parcels is not None):
         return known, []
     reason = f"{path.name}: {len(homeless)} of {len(rows.lines)} known rows lie in no parcel: {some_of(homeless)}"
@@ -178,13 +187,33 @@ def _known_vines(
     if path is None:
         return {}, []
     points = read_points(path, VINES, crs=parse_crs(config.rows_crs) if config.rows_crs else None, local=local)
-    parcels = {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
-    known = {name: vines_of(points, boundary) for name, boundary in parcels.items()}
+    known = {name: vines_of(points, boundary) for name, boundary in _bounds(polygons).items()}
     homeless = len(points) - len(set().union(*(own.index for own in known.values())))
     if not homeless or (homeless < len(points) and config.parcels is not None):
         return known, []
     reason = f"{path.name}: {homeless} of {len(points)} known vines stand in no parcel"
     return known, [Outcome("known vines", LEFT, reason=reason)]
+
+
+def _registered(
+    config: SurveyConfig,
+    date: datetime,
+    polygons: Mapping[str, Parcel | InputError | None],
+    rows: dict[str, KnownRows],
+    lost: list[Outcome],
+) -> Known | None:
+    """What the register says; it gives rows of its own to parcels for which none are known yet."""
+    register = known_of(config, date, _bounds(polygons))
+    if register:
+        register = register._replace(closed=register.closed | rows.keys())
+        rows |= {name: own for name, own in register.rows.items() if name not in rows}
+        lost += [Outcome("register", LEFT, reason=f"{register.path}: {remark}") for remark in register.remarks]
+    return register
+
+
+def _bounds(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Boundary | None]:
+    """Boundaries of the parcels that have one, or need none."""
+    return {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
 
 
 def _earlier(folder: Path) -> _Earlier:

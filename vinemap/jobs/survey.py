@@ -17,7 +17,8 @@ from vinemap.cloud.files import worded
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
-from vinemap.jobs.plan import DONE, FAILED, OUTSIDE, Outcome, Plan, plan_survey, write_record
+from vinemap.jobs.plan import DONE, FAILED, LEFT, OUTSIDE, Outcome, Plan, plan_survey, write_record
+from vinemap.jobs.register import is_due, note
 from vinemap.jobs.workers import Worker, Workers
 from vinemap.parcel import call, follow
 from vinemap.product.globe import survey_tileset
@@ -94,6 +95,7 @@ def map_survey(
             yield from _noted(plan.settled, outcomes)
             if plan.recipes:
                 yield from _noted(_work(plan, config, folder, aside, step), outcomes)
+            yield from _noted(_register(plan, config, folder, outcomes), outcomes)
         except InputError as error:
             done = {outcome.parcel for outcome in outcomes}
             left = [recipe for recipe in plan.recipes if recipe.parcel not in done]
@@ -106,6 +108,15 @@ def map_survey(
                 products = write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
                 _write_tileset(paths.tileset(folder), products)
                 _write_page(folder, config.survey)
+
+
+def _register(plan: Plan, config: SurveyConfig, folder: Path, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Write what the register is to know of a job; what is to be told of that."""
+    due = plan.due(outcomes)
+    if not plan.register or not (due or is_due(plan.register)):
+        return []
+    remarks = note(plan.register, plan.flown, config.survey, due, folder)
+    return [Outcome("register", LEFT, reason=remark) for remark in remarks]
 
 
 def _write_tileset(path: Path, products: Sequence[Path]) -> None:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
+from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
+from vinemap.geo.crs import project
 from vinemap.geo.raster import block_sum, cell_of
 from vinemap.rows.ends import UNSEEN as NOT_SEEN
 from vinemap.surfaces.statistics import LOWEST
@@ -29,7 +31,7 @@ SURE = 0.5
 """Confidence of a row that is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
-ASIDE = 0.4
+MISTAKEN = 0.4
 """Spacings by which a flight may lie off known rows before these are mistaken."""
 STEP = 0.5
 """Metres between the points of rows."""
@@ -95,7 +97,7 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
     chords = np.array([np.subtract(*shapely.get_coordinates(line)[[-1, 0]]) for line in rows.geometry])
     along = chords / np.linalg.norm(chords, axis=1)[:, None]
     aside = np.abs(along[:, 0] * shift.metres[1] - along[:, 1] * shift.metres[0])
-    if not (aside > ASIDE * rows["spacing_m"]).any():
+    if not (aside > MISTAKEN * rows["spacing_m"]).any():
         return []
     remark = (
         f"the flight lies {aside.max():.2f} m aside of the known rows, almost half of their distance or more: a row "
@@ -199,6 +201,34 @@ def sight_notices(rows: gpd.GeoDataFrame, row_ends: gpd.GeoDataFrame) -> list[st
         f"{open_ones} of {n} rows may go on: beyond their ends nothing was seen": open_ones > 0,
     }
     return [remark for remark, holds in remarks.items() if holds]
+
+
+def known_notices(rows: gpd.GeoDataFrame, known: gpd.GeoDataFrame) -> list[str]:
+    """Whether rows stand elsewhere than known lines, each another way: as those of another planting would.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineString with ``row_id``, ``spacing_m`` and ``support``.
+    known : GeoDataFrame
+        The lines by ``row_id``, in any CRS.
+    """
+    seen = rows[(rows["support"] > 0) & rows["row_id"].isin(known["row_id"])]
+    if len(seen) == 0:
+        return []
+    of = known.set_index("row_id").geometry.loc[seen["row_id"]].to_numpy()
+    spacing = float(np.nanmedian(seen["spacing_m"]))
+    before = np.asarray(project(of, known.crs, rows.crs), dtype=object)
+    off = lie_aside(seen.geometry.to_numpy(), before, spacing=spacing)
+    if not are_others(off, spacing=spacing):
+        return []
+    aside = off > ASIDE * spacing
+    far = float(np.median(off[aside]))
+    told = (
+        f"{aside.sum()} of {len(seen)} rows stand {far:.1f} m or so from where they are known, each another way: "
+        "if the parcel was planted anew, they are other rows"
+    )
+    return [told]
 
 
 def _covered(polygon: shapely.Geometry, seen: NDArray[np.bool_], grid: Grid, side: float) -> float:

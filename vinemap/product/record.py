@@ -11,7 +11,7 @@ import shapely
 from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
 from vinemap.geo.place import doubts_of
-from vinemap.product.notices import height_notices, notices, shift_notices, sight_notices
+from vinemap.product.notices import height_notices, known_notices, notices, shift_notices, sight_notices
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
@@ -114,6 +114,7 @@ def record_of(
         "warnings": _places(recipe, points)
         + [*(recipe.known.remarks if recipe.known else ()), *remarks]
         + shift_notices(shift, layers["rows"])
+        + (known_notices(layers["rows"], recipe.known.lines) if recipe.known else [])
         + _flights(points, dtm)
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])

@@ -100,6 +100,8 @@ SYMBOLS = {
     "sections": ("line", [{"line_width": "0.4", "capstyle": "flat"}]),
     "row_ends": ("marker", [{"color": rgba(PAPER), "outline_color": rgba(INK), "outline_width": "0.3", "size": "1.6"}]),
     "key_points": ("marker", [{"color": rgba(INK), "outline_style": "no", "size": "0.9"}]),
+    "candidates": ("line", [{"line_color": rgba("#f0a202"), "line_width": "0.7", "line_style": "dash"}]),
+    "history": ("line", [{"line_color": rgba(GREY), "line_width": "0.3", "line_style": "dot"}]),
     "track": ("line", [CASING | {"line_color": rgba(PAPER)}, {"line_color": rgba(TRACK), "line_width": "0.7"}]),
     "poses": ("marker", [{"outline_style": "no", "size": "1.3"}]),
     "vines": ("marker", [{"outline_width": "0.3", "size": "1.5"}]),
@@ -121,6 +123,8 @@ MAP_TIPS = {
     "[% if(unseen_m > 0, '<br>not seen: ' || round(unseen_m, 1) || ' m', '') %]"
     "<br>confidence: [% round(confidence, 2) %] in the row[% if(canopy_confidence is null, '', ', ' || "
     "round(canopy_confidence, 2) || ' in its canopy') %][% if(flags = '', '', '<br>' || flags) %]",
+    "candidates": "<b>[% label %]</b>, found by [% survey %]<br>confidence: [% round(confidence, 2) %]",
+    "history": "<b>[% label %]</b><br>[% date %]: [% what %] ([% by %])",
     "gaps": "<b>Gap in row [% label %]</b><br>[% round(length_m, 1) %] m, "
     "[% if(state = 'unseen', 'not seen', 'missing vines: ' || n_missing) %]",
     "vines": "<b>Row [% label %], [% number %]</b> at [% round(position_m, 1) %] m<br>[% state %]"
@@ -135,6 +139,12 @@ MAP_TIPS = {
     "poses": "<b>[% frame %]</b><br>heading [% round(heading_deg, 1) %]°<br>score [% round(score, 2) %]"
     "[% if(flag = '', '', '<br>flagged: ' || flag) %]",
 }
+
+
+KNOWN = ("line", [CASING, {"line_width": "0.9", "capstyle": "flat", "line_color": rgba(CANOPY[-2])}])
+"""Symbol of a row that nothing was measured of."""
+REGISTERED = "<b>Row [% label %]</b> of [% parcel %]<br>since [% since %][% coalesce(', edited ' || edited, '') %]"
+"""Its map tip."""
 
 
 class Style(NamedTuple):
@@ -191,23 +201,9 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
     table : GeoDataFrame
         Its features.
     """
-    symbol = SYMBOLS[layer]
-    if layer == "rows":
-        volume = (table["volume_m3"] / (table["length_m"] - table["unseen_m"])).to_numpy()
-        renderer = graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
-    elif layer == "sections":
-        renderer = graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
-    elif layer in CATEGORIES:
-        column, colours = CATEGORIES[layer]
-        there = {value: shade for value, shade in colours.items() if (table[column] == value).any()}
-        renderer = categorised(column, there or colours, symbol)
-    elif layer == "gaps":
-        states = {state: own for state, own in GAPS.items() if state == MISSING or (table["state"] == state).any()}
-        renderer = by_value("state", states, symbol)
-    elif layer == "poses":
-        renderer = graduated(FLAGGED, MEASURED_OR_NOT, symbol)
-    else:
-        renderer = single(symbol)
+    registered = layer == "rows" and "volume_m3" not in table
+    tip = REGISTERED if registered else MAP_TIPS.get(layer)
+    renderer = single(KNOWN) if registered else _renderer(layer, table)
     columns = [str(name) for name in table.columns if name != "geometry"]
     aliases = [node("alias", field=name, index=k, name=alias(name)) for k, name in enumerate(columns, start=1)]
     body = [renderer, node("aliases", *aliases)]
@@ -217,13 +213,33 @@ def vector_style(layer: str, table: gpd.GeoDataFrame) -> Style:
         direction = "degrees(azimuth(start_point($geometry), end_point($geometry))) - 90"
         body.append(labels_at_start("row_id", rotation=direction, scale=LABEL_SCALE, colour=INK))
         attributes["labelsEnabled"] = "1"
-    if layer in MAP_TIPS:
-        body.append(node("mapTip", MAP_TIPS[layer]))
+    if tip:
+        body.append(node("mapTip", tip))
     if "label" in columns:
         body.append(node("previewExpression", '"label"'))
     if layer in SMALLEST_SCALE:
         attributes |= {"hasScaleBasedVisibilityFlag": "1", "minScale": str(SMALLEST_SCALE[layer]), "maxScale": "0"}
     return Style(body, attributes)
+
+
+def _renderer(layer: str, table: gpd.GeoDataFrame) -> Element:
+    """What draws a layer of a product or a track."""
+    symbol = SYMBOLS[layer]
+    if layer == "rows":
+        volume = (table["volume_m3"] / (table["length_m"] - table["unseen_m"])).to_numpy()
+        return graduated(VOLUME_PER_METRE, classes_of(volume, VIGOUR, step=0.05, unit="m³/m"), symbol)
+    if layer == "sections":
+        return graduated("height_m", classes_of(table["height_m"].to_numpy(), VIGOUR, step=0.1, unit="m"), symbol)
+    if layer in CATEGORIES:
+        column, colours = CATEGORIES[layer]
+        there = {value: shade for value, shade in colours.items() if (table[column] == value).any()}
+        return categorised(column, there or colours, symbol)
+    if layer == "gaps":
+        states = {state: own for state, own in GAPS.items() if state == MISSING or (table["state"] == state).any()}
+        return by_value("state", states, symbol)
+    if layer == "poses":
+        return graduated(FLAGGED, MEASURED_OR_NOT, symbol)
+    return single(symbol)
 
 
 def raster_style(kind: str, values: NDArray[np.floating]) -> Style:
