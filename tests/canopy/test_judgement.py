@@ -53,6 +53,10 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
     assert confidence(sections_of(n=3), gap_m=LENGTH - 1) == 0
     assert confidence(sections_of(width=2.2), width_m=2.2) < 0.6
     assert confidence(sections_of(width=3.0), width_m=3.0, bottom_m=1.6) == 0
+    low = [
+        confidence(sections_of(width=0.2), height_m=height, width_m=0.2, bottom_m=0.22) for height in (0.5, 0.65, 1.0)
+    ]
+    assert low == pytest.approx([0.05, 0.56, 1.0], abs=0.01)
 
 
 def test_without_a_canopy_there_is_neither_confidence_nor_flag():

@@ -31,6 +31,9 @@ DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
 SPREADING = 2.5, 0.8
 """Ratios of width to depth of a canopy whose underside was hardly seen, and of one that hides little of it."""
+LOWLY, HIDDEN = 1.3, (0.45, 0.25)
+"""Metres below which a row's foliage begins no higher than where it is told from weeds, and shares of its height up to
+there, where its numbers are to be doubted, and where they aren't."""
 ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
 """Ratio of a row's height or width to the median of its block, or its inverse, and deviations from it, that are odd."""
 FEW, NEARBY = 3, 3.0
@@ -222,12 +225,12 @@ def lengths_of(sections: gpd.GeoDataFrame, step: float) -> Values:
 def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
     """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
 
-    The confidence, from 0 to 1, is the product of five shares: of the row's length without its gaps that has sections;
+    The confidence, from 0 to 1, is the product of six shares: of the row's length without its gaps that has sections;
     of the canopy that isn't cut at a side; of the canopy that was seen, on both sides from its lowest points to its
-    top; of the underside that isn't hidden, as it is where a canopy is wider than deep; and of the agreement of
-    sections a metre apart in width and area, in which canopies of one row don't differ much. Flagged are heights and
-    widths whose ratio to the median of their block, or of the rows around one that is of no block, is odd, if rows
-    there don't differ anyway.
+    top; of the underside that isn't hidden, as it is where a canopy is wider than deep; of what stands above
+    weeds, where it is low; and of the agreement of sections a metre apart in width and area, in which canopies of one
+    row don't differ much. Flagged are heights and widths whose ratio to the median of their block, or of the rows
+    around one that is of no block, is odd, if rows there don't differ anyway.
 
     Parameters
     ----------
@@ -254,6 +257,7 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
     height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
     confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)
+    confidence *= np.where(height < LOWLY, _between(bottom / np.maximum(height, CELL), HIDDEN), 1.0)
     flags = rows["flags"].tolist()
     groups = _comparable(rows)
     for name, sizes in (("height", height), ("width", width)):
