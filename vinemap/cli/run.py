@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,6 +12,7 @@ from vinemap.cli.options import FILE, OriginParam
 from vinemap.cli.terminal import progress
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 
@@ -48,12 +50,13 @@ def run(
     plain: bool,
 ) -> None:
     """Map the rows and canopies in CLOUD: LAS, LAZ or COPC files, worked as one, or folders of such."""
-    from vinemap import paths
-    from vinemap.cloud.files import cloud_files
-    from vinemap.config.names import check_parcel
-    from vinemap.config.settings import Settings
-    from vinemap.config.surveys import load_settings
-    from vinemap.geo.crs import parse_crs
+    with _importing():
+        from vinemap import paths
+        from vinemap.cloud.files import cloud_files
+        from vinemap.config.names import check_parcel
+        from vinemap.config.settings import Settings
+        from vinemap.config.surveys import load_settings
+        from vinemap.geo.crs import parse_crs
 
     survey = paths.named_by(cloud_files(clouds))
     name = check_parcel(parcel) if parcel is not None else survey
@@ -71,8 +74,18 @@ def run(
         "named": parcel is not None,
     }
     with progress(name) as step:
-        from vinemap.parcel import map_parcel
-
-        gc.freeze()  # what is imported lives on, so that no collection need look through it: 0.1 s each
+        with _importing():
+            from vinemap.parcel import map_parcel
         summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
     click.echo(summary.line())
+
+
+@contextmanager
+def _importing() -> Iterator[None]:
+    """What is imported lives on: it isn't looked through for garbage, neither meanwhile nor later (0.1 s each time)."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
