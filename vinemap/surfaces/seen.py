@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
+from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import normals, resample, way_along
 from vinemap.geo.raster import Grid, block_sum, cell_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Values
 
@@ -71,7 +75,7 @@ def seen_cells(cloud: Cloud, grid: Grid) -> Seen:
     """
     shown = np.zeros(grid.shape, dtype=np.uint8)
     for part in cloud.parts():
-        shown.ravel()[cell_of(part.xyz, grid)] = 1
+        in_threads(partial(_show, shown.ravel(), part.xyz, grid), stretches(part.size))
     widest = 0
     for k in count(1):
         cells = block_sum(shown, k) > 0
@@ -97,6 +101,11 @@ def _holes(shown: Flags) -> Flags:
         for j in (slice(None, -1), slice(1, None)):
             out[i, j] |= corner
     return out
+
+
+def _show(shown: NDArray[np.uint8], xyz: Values, grid: Grid, some: tuple[int, int]) -> None:
+    """Mark the cells of a grid, one after the other, in which some of the points (n, 3) lie."""
+    shown[cell_of(xyz[slice(*some)], grid)] = 1
 
 
 def _usual(shown: Flags) -> bool:
