@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import shapely
 from lasfiles import write_each
+from products import map_here
 
 from vinemap.cloud.points import PointCloud
 from vinemap.config.surveys import survey_config
 from vinemap.geo.crs import parse_crs
-from vinemap.jobs.survey import map_survey
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate, write_survey
@@ -92,5 +92,5 @@ def flights(tmp_path_factory):
             cloud.write(struct.pack("<HH", day, year))
         parcels = ["A", "one", "meadow", *(["nobody's"] if name == "september" else [])]
         config = survey_config(survey=name, cloud=path, boundaries=path.with_name("parcels.gpkg"), parcels=parcels)
-        list(map_survey(config, folder / "products" / name))
+        map_here(config, folder / "products" / name)
     return folder / "products"

@@ -1,19 +1,58 @@
-"""Products of surveys, compared byte for byte, and boundaries of many parcels."""
+"""Products of surveys, made and compared byte for byte, and boundaries of many parcels."""
 
 import json
+from contextlib import nullcontext
 
 import geopandas as gpd
 import numpy as np
 import pandas as pd
 import pyogrio
+import pytest
 import shapely
 
 from vinemap import paths
+from vinemap.errors import VinemapError, WorkerError
 from vinemap.geo.crs import WGS84, parse_crs, project
+from vinemap.jobs import survey
 from vinemap.product.layers import LAYERS, TEXT, WHOLE
 
 SURVEYS = ["collection.json", "index.html", "survey.json", "three_stac.json", "tileset.json"]
 """Files of a survey, beside the folders of its products."""
+
+
+class Here:
+    """What runs calls in this very process, instead of others."""
+
+    slots = 1
+
+    def __init__(self, **options):
+        pass
+
+    def run(self, function, *args, limit=None, **kwargs):
+        try:
+            return function(*args, **kwargs)
+        except VinemapError:
+            raise
+        except Exception as error:  # as a worker would
+            raise WorkerError(f"a fault of vinemap's own ({error})") from error
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+
+def without_workers(patch):
+    """Have surveys worked in this process, as others are slow to start and often aren't what is tested."""
+    patch.setattr(survey, "_engine", lambda plan, config: nullcontext(Here()))
+    patch.setattr(survey, "Worker", Here)
+
+
+def map_here(config, folder):
+    with pytest.MonkeyPatch.context() as patch:
+        without_workers(patch)
+        return list(survey.map_survey(config, folder))
 
 
 def tree(folder):

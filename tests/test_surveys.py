@@ -1,6 +1,7 @@
 """Simulated surveys by another hand: rows, terrain and Table 2.1, by the bars that the product keeps."""
 
 import json
+from functools import cache
 
 import geopandas as gpd
 import laspy
@@ -63,8 +64,9 @@ def true_outlines(profiles, canopy):
 
 @pytest.fixture(scope="module")
 def modelled(shared):
-    """Canopies of a shared survey, of a share of its points."""
+    """Canopies of a shared survey, of a share of its points, each once."""
 
+    @cache
     def modelled(name, share=1.0):
         source = shared / "surveys" / name
         points = read_cloud(source / f"{name}.laz", boundary=read_boundary(source / "boundary.gpkg"))

@@ -9,11 +9,14 @@ import time
 from pathlib import Path
 
 import pytest
-from products import SURVEYS, many, tree
+from commands import here
+from products import SURVEYS, map_here, tree
 
+import vinemap
 from vinemap.config.surveys import survey_config
-from vinemap.errors import ConfigError
+from vinemap.errors import ConfigError, WorkerError
 from vinemap.jobs import survey
+from vinemap.jobs.dask import DaskWorkers
 from vinemap.jobs.plan import DONE
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import follow
@@ -23,7 +26,7 @@ pytest.importorskip("distributed", reason="needs Dask: pip install 'vinemap[dask
 
 def start(*words, cwd):
     log = (cwd / "dask.log").open("ab")
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "DASK_LOGGING__DISTRIBUTED": "warning"}
+    environment = here(os.environ, Path(__file__).parents[1]) | {"DASK_LOGGING__DISTRIBUTED": "warning"}
     with log:
         return subprocess.Popen(
             [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
@@ -82,23 +85,21 @@ def by_dask(cluster):
 
 def test_products_are_the_same_byte_for_byte(cluster, three, tmp_path):
     boundaries = three.with_name("parcels.gpkg")
-    here = job(three, tmp_path / "here", boundaries)
-    there = job(three, tmp_path / "there", boundaries, **by_dask(cluster))
-    assert [outcome.state for outcome in here + there] == [DONE] * 6
+    mine = map_here(survey_config(survey="three", cloud=three, boundaries=boundaries), tmp_path / "here")
+    theirs = job(three, tmp_path / "there", boundaries, **by_dask(cluster))
+    assert [outcome.state for outcome in mine + theirs] == [DONE] * 6
     assert tree(tmp_path / "here") == tree(tmp_path / "there")
     assert {path.name for path in (tmp_path / "there").iterdir()} == {"A", "B", "C", *SURVEYS}
 
 
 def misbehave(recipe, folder, **options):
-    """Work a parcel, or do what its name says; B0 first kills the worker of the cluster that has it."""
-    if recipe.parcel == "B0" and not (mark := folder.parent.parent / "killed").exists():
+    """Work a parcel; B first kills the worker of the cluster that has it, and C crashes."""
+    if recipe.parcel == "B" and not (mark := folder.parent.parent / "killed").exists():
         mark.touch()
         os.kill(worker_of(os.getpid()), signal.SIGKILL)
         time.sleep(60)
-    if recipe.parcel == "C0":
+    if recipe.parcel == "C":
         os.abort()
-    if recipe.parcel == "C1":
-        time.sleep(60)
     return follow(recipe, folder, **options)
 
 
@@ -109,16 +110,22 @@ def worker_of(pid):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, three, tmp_path, monkeypatch):
-    """Nor do calls that crash or hang cost the cluster a worker."""
-    many(three, tmp_path / "many.gpkg", 2)
+    """Nor do calls that crash cost the cluster a worker."""
     monkeypatch.setattr(survey, "follow", misbehave)
-    outcomes = job(three, tmp_path / "out", tmp_path / "many.gpkg", limit=10, **by_dask(cluster))
+    outcomes = job(three, tmp_path / "out", three.with_name("parcels.gpkg"), **by_dask(cluster))
     found = {outcome.parcel: outcome for outcome in outcomes}
-    assert {name for name, outcome in found.items() if outcome.state == DONE} == {"A0", "A1", "B0", "B1"}
-    assert found["C0"].line() == "C0: failed: its process died (SIGABRT)"
-    assert found["C1"].line() == "C1: failed: took longer than 10 s"
+    assert {name for name, outcome in found.items() if outcome.state == DONE} == {"A", "B"}
+    assert found["C"].line() == "C: failed: its process died (SIGABRT)"
     assert (tmp_path / "killed").exists()
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"A0", "A1", "B0", "B1", *SURVEYS}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"A", "B", *SURVEYS}
+
+
+def test_calls_that_hang_do_not_keep_a_worker(cluster):
+    with DaskWorkers(cluster[0]) as workers:
+        for _ in range(2):
+            with pytest.raises(WorkerError, match=r"took longer than 0\.5 s"):
+                workers.run(time.sleep, 600, limit=0.5)
+        assert workers.run(eval, "__import__('vinemap').__file__") == vinemap.__file__
 
 
 def test_a_scheduler_that_does_not_answer(three, tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import shapely
 from commands import vinemap
+from products import without_workers
 from systems import LINUX, POSIX
 
 from vinemap import paths
@@ -25,7 +26,7 @@ from vinemap.cloud.pieces import read_piece, split_cloud
 from vinemap.cloud.tiles import Collector
 from vinemap.compute.processes import descendants
 from vinemap.config.surveys import survey_config
-from vinemap.errors import BusyError, InputError, OutputError, VinemapError, WorkerError
+from vinemap.errors import BusyError, InputError, OutputError, VinemapError
 from vinemap.geo.boundaries import read_parcels
 from vinemap.geo.crs import parse_crs
 from vinemap.jobs import survey
@@ -61,29 +62,6 @@ def write_polygons(path, polygons, *, crs=32632):
     path.unlink(missing_ok=True)
     gpd.GeoDataFrame({"name": list(polygons)}, geometry=shapes, crs=crs).to_file(path)
     return path
-
-
-class Here:
-    """What runs calls in this very process, instead of others."""
-
-    slots = 1
-
-    def __init__(self, **options):
-        pass
-
-    def run(self, function, *args, limit=None, **kwargs):
-        try:
-            return function(*args, **kwargs)
-        except VinemapError:
-            raise
-        except Exception as error:  # as a worker would
-            raise WorkerError(f"a fault of vinemap's own ({error})") from error
-
-    def stop(self):
-        pass
-
-    def close(self):
-        pass
 
 
 class Job:
@@ -135,8 +113,7 @@ def left(folder):
 @pytest.fixture
 def job(tmp_path, monkeypatch):
     monkeypatch.setattr(survey, "follow", doubles.follow)
-    monkeypatch.setattr(survey, "_engine", lambda plan, config: contextlib.nullcontext(Here()))
-    monkeypatch.setattr(survey, "Worker", Here)
+    without_workers(monkeypatch)
     return Job(tmp_path)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import shapely
 from commands import assert_refused, vinemap
-from products import SURVEYS, content, many, tree
+from products import SURVEYS, content, many, map_here, tree
 from systems import POSIX
 
 from vinemap import paths
@@ -53,9 +53,12 @@ def mapped(cloud, boundaries, tmp_path_factory):
     return {outcome.parcel: outcome for outcome in outcomes}, folder
 
 
-def job(cloud, folder, *, boundaries, again=False, step=None, **options):
-    config = survey_config(survey="three", cloud=cloud, boundaries=boundaries, **options)
-    return map_survey(config, folder, again=again, **({"step": step} if step else {}))
+def configured(cloud, boundaries, **options):
+    return survey_config(survey="three", cloud=cloud, boundaries=boundaries, **options)
+
+
+def job(cloud, folder, *, boundaries, **options):
+    return map_survey(configured(cloud, boundaries, **options), folder)
 
 
 @pytest.mark.parametrize("parcel", ["A", "B", "C", "inner A"])
@@ -183,15 +186,14 @@ def test_the_longest_names(cloud, tmp_path):
     parcels = gpd.read_file(cloud.with_name("parcels.gpkg"))
     names = ["é" * 64, "葡" * 53, "🍇" * 40]
     gpd.GeoDataFrame({"name": names}, geometry=parcels.geometry, crs=parcels.crs).to_file(tmp_path / "long.gpkg")
-    options = {"settings": {"product": {"classified": True}}, "job": {"workers": 1}}
-    options["boundaries"] = tmp_path / "long.gpkg"
-    outcomes = list(job(cloud, tmp_path / "out", **options))
+    config = configured(cloud, tmp_path / "long.gpkg", settings={"product": {"classified": True}})
+    outcomes = map_here(config, tmp_path / "out")
     assert {outcome.parcel: outcome.state for outcome in outcomes} == dict.fromkeys(names, DONE)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([*names, *SURVEYS])
     for name in names:
         assert len(gpd.read_file(paths.geopackage(tmp_path / "out" / name, name), layer="rows")) > 0
         assert product_in(tmp_path / "out" / name)
-    assert {outcome.state for outcome in job(cloud, tmp_path / "out", **options)} == {CURRENT}
+    assert {outcome.state for outcome in map_here(config, tmp_path / "out")} == {CURRENT}
 
 
 @pytest.mark.parametrize("most", [np.inf, 1000])
@@ -278,8 +280,7 @@ def test_a_job_that_is_stopped_leaves_nothing(cloud, tmp_path, number, code):
 def test_a_job_that_is_killed_loses_nothing(mapped, cloud, boundaries, tmp_path):
     """Killed at any instant while it replaces products: each parcel's is whole, and the next job makes the rest."""
     outcomes, folder = mapped
-    options = {"parcels": [*outcomes], "boundaries": boundaries, "job": {"workers": 1}}
-    list(job(cloud, tmp_path / "old", settings={"polygon": {"c": 9}}, **options))
+    map_here(configured(cloud, boundaries, parcels=[*outcomes], settings={"polygon": {"c": 9}}), tmp_path / "old")
     old, new = tree(tmp_path / "old"), tree(folder)
     assert old.keys() == new.keys()
     products = {name.split("/")[0] for name in new if "/" in name}
@@ -306,7 +307,7 @@ def test_a_job_that_is_killed_loses_nothing(mapped, cloud, boundaries, tmp_path)
         left = tree(out)
         for product in products:
             assert part(left, product) in (part(old, product), part(new, product))
-        list(job(cloud, out, **options))
+        map_here(configured(cloud, boundaries, parcels=[*outcomes]), out)
         assert tree(out) == new
 
 

@@ -11,6 +11,7 @@ import pytest
 import rasterio
 import shapely
 import trimesh
+from products import map_here
 from pyproj import CRS, Transformer
 
 from vinemap import paths
@@ -19,7 +20,7 @@ from vinemap.config.settings import Settings
 from vinemap.config.surveys import survey_config
 from vinemap.geo.crs import to_wgs84
 from vinemap.geo.geoid import find_geoid
-from vinemap.jobs.survey import _write_tileset, map_survey
+from vinemap.jobs.survey import _write_tileset
 from vinemap.product.globe import parcel_tileset, survey_tileset
 from vinemap.product.gltf import write_glb
 
@@ -273,7 +274,7 @@ def mapped(three, tmp_path_factory):
         boundaries=three.with_name("parcels.gpkg"),
         settings=Settings.model_validate({"product": {"geoid": 48.0}}),
     )
-    assert {outcome.state for outcome in map_survey(config, folder)} == {"done"}
+    assert {outcome.state for outcome in map_here(config, folder)} == {"done"}
     return folder
 
 

@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 import subprocess
-import time
 import zlib
 from datetime import UTC, datetime
 from html.parser import HTMLParser
@@ -321,9 +320,7 @@ def test_a_page_of_many_parcels_stays_small(copy):
             path.rename(path.with_name(re.sub(r"^A(?=[_.])", str(k), path.name)))
         path = paths.run_record(folder / f"{k}")
         path.write_text(json.dumps(json.loads(path.read_text()) | {"parcel": str(k), "survey": "many"}))
-    began = time.perf_counter()
     assert write_index(folder, "many")
-    assert (time.perf_counter() - began) / n < 0.2
     parcels = by_parcel(survey_index(folder))
     assert len(parcels) == n
     assert all(parcel["summary"]["same"] == 4 for parcel in parcels.values())
