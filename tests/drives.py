@@ -1,5 +1,7 @@
 """Drives of a robot whose poses are known, as frames in memory."""
 
+from functools import cache
+
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import Pose
 from vinemap.simulate.camera import LOW, lay_ground, render
@@ -18,6 +20,7 @@ def poses(n, *, step=40.0, turn=1.0, x=-1300.0):
     return out
 
 
+@cache
 def ground(name="gravel", seed=4):
     return lay_ground(name, size_mm=(1800, 1400), seed=seed)
 

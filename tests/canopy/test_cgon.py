@@ -154,7 +154,7 @@ def brute_force(q, feet, c):
 def test_area_is_the_least_of_all_choices_of_edges(c):
     rng = np.random.default_rng(c)
     compared = 0
-    while compared < (15 if c < 9 else 5):
+    while compared < (8 if c < 9 else 3):
         points, feet = canopy(rng, 25)
         q = outline(points, feet)
         if c <= len(q) <= 13:
@@ -173,10 +173,10 @@ def test_an_edge_that_touches_at_its_midpoint_is_found():
     np.testing.assert_allclose(polygon[2:4], [[0.53, 1.1], [-0.53, 1.1]], atol=1e-12)
 
 
-@pytest.mark.parametrize("tenth", range(10))
-def test_bilinear_programme_never_beats_the_choice_of_edges(tenth):
-    """Eq. 16 in the c - 3 free vertices, solved by SLSQP from several starts, on 500 random sets."""
-    for seed in range(50 * tenth, 50 * tenth + 50):
+@pytest.mark.parametrize("fifth", range(5))
+def test_bilinear_programme_never_beats_the_choice_of_edges(fifth):
+    """Eq. 16 in the c - 3 free vertices, solved by SLSQP from several starts, on 200 random sets."""
+    for seed in range(40 * fifth, 40 * fifth + 40):
         rng = np.random.default_rng(seed)
         c = (5, 6, 7)[seed % 3]
         points, feet = canopy(rng, 30)

@@ -260,7 +260,7 @@ def outcome(path):
 
 def test_random_damage_ends_in_a_cloud_or_a_line(clouds, tmp_path):
     rng = np.random.default_rng(5)
-    for k in range(240):
+    for k in range(120):
         whole = clouds[[*clouds][k % len(clouds)]]
         data = bytearray(whole.read_bytes())
         for at in rng.integers(0, len(data) if k % 2 else 700, 3):

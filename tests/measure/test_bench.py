@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -19,7 +20,7 @@ from vinemap.measure.bench.__main__ import main, parse_sizes
 from vinemap.measure.bench.alternatives import course, memory_since
 from vinemap.measure.bench.bars import Bar, Run, bars, growth_exponent, growth_ratio, of_bar, span, with_other
 from vinemap.measure.bench.plot import draw
-from vinemap.measure.bench.runs import ensure_survey, instead, many, prefect
+from vinemap.measure.bench.runs import instead, many, prefect
 from vinemap.measure.bench.surveys import plot
 from vinemap.measure.bench.tables import bar_table, figures, stage_table, write_tables
 
@@ -57,13 +58,14 @@ def test_growth(exponent):
 
 def test_memory_of_processes_is_summed():
     held = "x = bytearray(60_000_000); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(1.5)"
+    others = sum(map(processes.resident, processes.descendants(os.getpid())))
     with processes.summed_memory() as most:
         children = [subprocess.Popen([sys.executable, "-c", held]) for _ in range(2)]
         for child in children:
             child.wait()
     if not Path("/proc/self/statm").is_file():
         pytest.skip("needs /proc, which this system hasn't")
-    assert 120e6 < most[0] < 250e6
+    assert 120e6 < most[0] - others < 250e6
     assert processes.resident(children[0].pid) == 0
 
 
@@ -230,6 +232,5 @@ def test_a_small_benchmark(tmp_path):
         assert word in done.output
     for module, tool in (("CSF", "cloth-simulation-filter "), ("sklearn", "DBSCAN of"), ("cv2", "approxPolyN of")):
         assert (tool if find_spec(module) else f"{module} isn't installed") in done.output
-    before = cloud.stat().st_mtime_ns
-    assert ensure_survey(0.1, tmp_path)["cloud"] == str(cloud)
-    assert cloud.stat().st_mtime_ns == before
+    # What stands in for steps asked for the same survey again, after it had been mapped.
+    assert cloud.stat().st_mtime_ns < (tmp_path / "products" / "0.1M" / "run.json").stat().st_mtime_ns
