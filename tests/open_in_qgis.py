@@ -1,8 +1,9 @@
-"""Open a project or a GeoPackage's layers as QGIS does, tell in JSON what it sees, and draw the map.
+"""Open projects or GeoPackages' layers as QGIS does, tell what it sees, and draw the map.
 
-usage: QT_QPA_PLATFORM=offscreen PYTHON_OF_QGIS open_in_qgis.py FILE PNG [PAGE]
+usage: QT_QPA_PLATFORM=offscreen PYTHON_OF_QGIS open_in_qgis.py
 
-It runs with the Python that QGIS is installed for. PAGE is where the project's page to print goes, as PNG.
+It runs with the Python that QGIS is installed for, and first says its version. Each line that comes in is the JSON of
+[FILE, PNG, PAGE], where PAGE is for the project's page to print, as PNG, or null; one with what was seen goes out.
 """
 
 import json
@@ -95,8 +96,9 @@ def draw(layers, extent, crs, png, width=1400, dpi=144):
     return {"drawn_at": round(settings.scale()), "errors": [e.message for e in job.errors()], "colours": len(colours)}
 
 
-def main(path, png, page=None):
+def look(path, png, page):
     project = QgsProject.instance()
+    project.clear()
     if path.endswith((".qgz", ".qgs")):
         read = project.read(path)
         tree = project.layerTreeRoot()
@@ -111,7 +113,7 @@ def main(path, png, page=None):
         for layer in layers:
             here = QgsCoordinateTransform(layer.crs(), crs, project)
             extent.combineExtentWith(here.transformBoundingBox(layer.extent()))
-    report = {"qgis": Qgis.QGIS_VERSION, "read": read, "title": project.title(), "crs": crs.authid()}
+    report = {"read": read, "title": project.title(), "crs": crs.authid()}
     report["extent"] = [extent.xMinimum(), extent.yMinimum(), extent.xMaximum(), extent.yMaximum()]
     report["layers"] = [told(layer) for layer in everything]
     if path.endswith(".qgz"):
@@ -119,13 +121,19 @@ def main(path, png, page=None):
         report["visible"] = [layer.name() for layer in layers]
     if page:
         report |= print_page(project, page)
-    sys.stdout.write(json.dumps(report | draw(layers, extent, crs, png)))
+    return report | draw(layers, extent, crs, png)
+
+
+def say(what):
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":
     QgsApplication.setPrefixPath("/usr", useDefaultPaths=True)
     application = QgsApplication([], GUIenabled=False)
     application.initQgis()
-    main(*sys.argv[1:])
-    sys.stdout.flush()
+    say(Qgis.QGIS_VERSION)
+    for line in sys.stdin:
+        say(look(*json.loads(line)))
     os._exit(0)  # PyQGIS crashes when it is left the usual way

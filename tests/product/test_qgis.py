@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
+from threading import Timer
 
 import cv2
 import numpy as np
@@ -31,39 +32,45 @@ PYTHONS = [os.environ.get("QGIS_PYTHON"), "/usr/bin/python3"]
 """Pythons that QGIS may be installed for, an own choice first."""
 
 
-def environment(folder):
+def start(python, program, *args, folder):
+    """A QGIS that runs a program of ours, with pipes to it; what it says of errors stands in ``said.txt``."""
     (folder / "runtime").mkdir(mode=0o700, exist_ok=True)
     env = {"PATH": os.defpath, "HOME": str(folder), "LC_ALL": "C.UTF-8", "QT_QPA_PLATFORM": "offscreen"}
-    return env | {"XDG_RUNTIME_DIR": str(folder / "runtime")}
-
-
-def run(python, *args, folder):
-    words = [python, *map(str, args)]
-    return subprocess.run(words, env=environment(folder), capture_output=True, text=True, check=False, timeout=120)
+    env |= {"XDG_RUNTIME_DIR": str(folder / "runtime")}
+    pipe = subprocess.PIPE
+    with (folder / "said.txt").open("wb") as said:
+        return subprocess.Popen([python, program, *args], env=env, stdin=pipe, stdout=pipe, stderr=said, text=True)
 
 
 @pytest.fixture(scope="module")
 def qgis(tmp_path_factory):
-    """The Python that QGIS is installed for, and a home for it."""
+    """The Python that QGIS is installed for, a home for it, and a QGIS that opens what it is told to."""
     folder = tmp_path_factory.mktemp("home")
-    found = (
-        p for p in PYTHONS if p and Path(p).exists() and not run(p, "-c", "import qgis.core", folder=folder).returncode
-    )
-    python = next(found, None)
-    if python is None:
-        pytest.skip("needs QGIS for Python: apt-get install --no-install-recommends python3-qgis, or set QGIS_PYTHON")
-    return python, folder
+    for python in PYTHONS:
+        if python and Path(python).exists():
+            with start(python, OPEN, folder=folder) as opener:
+                if opener.stdout.readline():
+                    yield python, folder, opener
+                    opener.stdin.close()
+                    return
+    pytest.skip("needs QGIS for Python: apt-get install --no-install-recommends python3-qgis, or set QGIS_PYTHON")
 
 
 @pytest.fixture(scope="module")
 def open_in_qgis(qgis):
-    python, folder = qgis
+    """What QGIS sees in a file, of which it draws a picture of a name, by the file and the name."""
+    _, folder, opener = qgis
     PICTURES.mkdir(parents=True, exist_ok=True)
 
-    def opened(path, name, *page):
-        done = run(python, OPEN, path, PICTURES / f"{name}.png", *page, folder=folder)
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout)
+    def opened(path, name, page=None):
+        waited = Timer(120, opener.kill)
+        waited.start()
+        opener.stdin.write(json.dumps([str(path), str(PICTURES / f"{name}.png"), page and str(page)]) + "\n")
+        opener.stdin.flush()
+        seen = opener.stdout.readline()
+        waited.cancel()
+        assert seen, (folder / "said.txt").read_text()
+        return json.loads(seen)
 
     return opened
 
@@ -180,9 +187,8 @@ def test_a_register_is_edited_while_it_is_written(qgis, open_in_qgis, tmp_path):
     path = tmp_path / "register.gpkg"
     list(register_products([tmp_path / "june" / name for name in "FG"], path))
     square = {"F": (shapely.box(427990, 4939990, 428040, 4940020), read_register(path).crs)}
-    python, folder = qgis
-    pipe = subprocess.PIPE
-    with subprocess.Popen([python, EDIT, path], env=environment(folder), stdin=pipe, stdout=pipe, text=True) as editor:
+    python, _, _ = qgis
+    with start(python, EDIT, path, folder=tmp_path) as editor:
         assert editor.stdout.readline() == "saved\n"
         update_register(path, lambda register: Update(*settle(register, "2026-07-01", square)[:2]))
         editor.stdin.close()
