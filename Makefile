@@ -46,7 +46,7 @@ nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=config
 	@exec $(BIN)/python -m flows.nightly "$$CONFIG" --serve
 
 test: $(READY) ## Run the tests, two files at once
-	@$(BIN)/python -m pytest -n 2 --dist loadfile
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis
 	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py

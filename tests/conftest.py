@@ -19,6 +19,16 @@ from vinemap.simulate.survey import simulate, write_survey
 from vinemap.simulate.terrain import hillside
 
 SHARED = Path(__file__).parents[2] / "shared"
+ORDER = ["test_parcel.py", "odometry", "config", "simulate", "jobs", "flows", "cli", "measure"]
+"""Files and folders that come first: one that compiles all loops, what needs none of them meanwhile, and the slow ones.
+
+So no two processes compile the same, and at the end neither waits long for the other.
+"""
+
+
+def pytest_collection_modifyitems(items):
+    ranks = {name: k for k, name in enumerate(ORDER)}
+    items.sort(key=lambda item: min(ranks.get(name, len(ORDER)) for name in (item.path.name, item.path.parent.name)))
 
 
 @pytest.fixture(scope="session")
