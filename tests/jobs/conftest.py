@@ -1,0 +1,23 @@
+"""Jobs with made-up work that several tests share."""
+
+import doubles
+import pytest
+from products import without_workers
+from squares import Job
+
+from vinemap.jobs import survey
+from vinemap.jobs.plan import DONE
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    monkeypatch.setattr(survey, "follow", doubles.follow)
+    without_workers(monkeypatch)
+    return Job(tmp_path)
+
+
+@pytest.fixture
+def done(job):
+    """A job that has been done once."""
+    assert job.states() == dict.fromkeys("ABC", DONE)
+    return job
