@@ -1,4 +1,4 @@
-"""Jobs with made-up work that several tests share."""
+"""Jobs with made-up work, and a folder in which surveys arrive."""
 
 import doubles
 import pytest
@@ -21,3 +21,9 @@ def done(job):
     """A job that has been done once."""
     assert job.states() == dict.fromkeys("ABC", DONE)
     return job
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "in").mkdir()
+    return tmp_path / "in"

@@ -1,51 +1,17 @@
-"""Surveys that arrive in a folder: found, told from uploads, and one's fault costing no other."""
+"""Surveys that arrive in a folder: found, named and told, and one's fault costing no other."""
 
 import os
-import shutil
-import time
 import zipfile
 from pathlib import Path
 
-import geopandas as gpd
 import laspy
 import pytest
-import shapely
+from arriving import NOW, found, polygons, put, reasons
 from systems import POSIX
 
 from vinemap.cloud.las import read_cloud
-from vinemap.config.surveys import EstateConfig, load_estate
 from vinemap.errors import InputError
 from vinemap.jobs import estate
-from vinemap.jobs.estate import arrivals
-
-NOW = time.time() + 3600
-"""When files that were just written are long settled."""
-
-
-@pytest.fixture
-def place(tmp_path):
-    (tmp_path / "in").mkdir()
-    return tmp_path / "in"
-
-
-def found(place, *, now=NOW, **options):
-    return list(arrivals(EstateConfig(surveys=place, **options), now=now))
-
-
-def reasons(place, **options):
-    """What is said of surveys that can't be worked."""
-    return {arrival.name: arrival.reason for arrival in found(place, **options)}
-
-
-def put(cloud, *places):
-    for place in places:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(cloud, place)
-
-
-def polygons(path):
-    gpd.GeoDataFrame({"name": ["A"]}, geometry=[shapely.box(7, 44, 7.1, 44.1)], crs=4326).to_file(path)
-    return path
 
 
 def test_surveys_are_files_and_folders(clouds, place):
@@ -137,19 +103,6 @@ def test_polygons_in_another_form_are_told_where_there_are_none(clouds, place, n
     assert found(place)[0].passed == ()
 
 
-def test_a_survey_waits_for_the_last_of_its_files(clouds, place):
-    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "b.laz.part")
-    assert found(place)[0].waits
-
-
-def test_polygons_wait_for_their_cloud(place):
-    (place / "may").mkdir()
-    polygons(place / "may" / "parcels.gpkg")
-    (arrival,) = found(place)
-    assert arrival.waits
-    assert arrival.reason == f"{place / 'may'}: holds polygons, but no cloud: put LAS or LAZ there"
-
-
 def test_clouds_in_deeper_folders_are_told(clouds, place):
     put(clouds["laz 1.4"], place / "may" / "lidars" / "terra" / "a.laz", place / "may" / ".trash" / "b.laz")
     assert "its clouds lie in lidars/terra: move them up, or say 'cloud: lidars/terra'" in reasons(place)["may"]
@@ -178,59 +131,6 @@ def test_hidden_files_of_a_survey_are_left_out(clouds, place):
     polygons(place / "may" / "parcels.gpkg")
     polygons(place / "may" / "x.gpkg").rename(place / "may" / ".parcels.gpkg")
     assert [arrival.reason for arrival in found(place)] == [""]
-
-
-def test_an_upload_waits_until_it_stays_as_it_is(clouds, place):
-    path = place / "may.laz"
-    put(clouds["laz 1.4"], path)
-    changed = path.stat().st_mtime
-    for age, waits in ((0, True), (1, True), (299, True), (301, False), (1e6, False)):
-        (arrival,) = found(place, now=changed + age)
-        assert arrival.waits is waits, age
-        assert bool(arrival.config) is not waits
-    (arrival,) = found(place, now=changed + 20)
-    assert arrival.reason == "changed 20 s ago, waits until 300 s"
-    (arrival,) = found(place, now=changed + 20, settle=10)
-    assert arrival.config
-    (arrival,) = found(place, now=changed, settle=0)
-    assert arrival.config
-
-
-@pytest.mark.parametrize("young", ["a.laz", "parcels.gpkg", "survey.yaml"])
-def test_every_file_of_a_survey_must_stay_as_it_is(clouds, place, young):
-    put(clouds["laz 1.4"], place / "may" / "a.laz")
-    polygons(place / "may" / "parcels.gpkg")
-    (place / "may" / "survey.yaml").write_text("crs: EPSG:32632\n")
-    for path in (place / "may").iterdir():
-        os.utime(path, (NOW - 1000, NOW - 1000))
-    assert found(place)[0].config
-    os.utime(place / "may" / young, (NOW - 10, NOW - 10))
-    (arrival,) = found(place)
-    assert arrival.waits
-    assert arrival.reason == "changed 10 s ago, waits until 300 s"
-
-
-def test_an_upload_that_pauses_waits_for_a_day(clouds, place):
-    path = place / "may.laz"
-    put(clouds["laz 1.4"], path)
-    os.truncate(path, 5000)
-    os.utime(path, (NOW - 1000, NOW - 1000))
-    (arrival,) = found(place)
-    assert (arrival.config, arrival.waits) == (None, True)
-    assert arrival.reason == f"{path}: ends before its table of chunks: is its upload over?"
-    os.utime(path, (NOW - estate.LATE - 1, NOW - estate.LATE - 1))
-    assert not found(place)[0].waits
-
-
-def test_a_clock_that_is_ahead_holds_nothing_up(clouds, place):
-    """A file of the future can't be waited for, but may still be unfinished."""
-    path = place / "may.laz"
-    put(clouds["laz 1.4"], path)
-    os.utime(path, (NOW + 1e6, NOW + 1e6))
-    assert found(place)[0].config
-    os.truncate(path, 5000)
-    os.utime(path, (NOW + 1e6, NOW + 1e6))
-    assert found(place)[0].waits
 
 
 def test_several_clouds_are_one(clouds, place):
@@ -332,95 +232,6 @@ def test_names_that_are_no_unicode_within_a_survey(clouds, place, kind):
     assert not arrival.config
     assert "rename it" in arrival.reason
     assert arrival.reason.encode()
-
-
-def test_its_own_file(clouds, place):
-    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "may" / "raw" / "b.laz")
-    polygons(place / "drawn.gpkg")
-    own = "survey: other\ncloud: raw/b.laz\nboundaries: ../drawn.gpkg\nsettings: {polygon: {c: 9}}\njob: {limit: 60}\n"
-    (place / "may" / "survey.yaml").write_text(own)
-    (arrival,) = found(place)
-    assert arrival.config.survey == arrival.name == "may"
-    assert arrival.config.cloud.samefile(place / "may" / "raw" / "b.laz")
-    assert arrival.config.boundaries.samefile(place / "drawn.gpkg")
-    assert (arrival.config.settings.polygon.c, arrival.config.job.limit) == (9, 60)
-    (place / "may" / "survey.yaml").write_text(f"cloud: {place / 'may' / 'raw' / 'b.laz'}\n")
-    assert found(place)[0].config.cloud == place / "may" / "raw" / "b.laz"
-
-
-@pytest.mark.parametrize(
-    ("own", "said"),
-    [
-        ("cluod: a.laz", "unknown key cluod: did you mean 'cloud'?"),
-        ("settle: 5", "unknown key settle"),
-        ("cloud: b.laz", "b.laz: no such file"),
-        ("cloud: ../..", "holds no LAS, LAZ or COPC file"),
-        ("cloud: [a.laz, b.laz]", "b.laz: no such file"),
-        ("cloud: []", "holds no cloud"),
-        ('cloud: "a\\0b.laz"', "no such file"),
-        ("cloud: " + "x" * 300, ""),
-        ("boundaries: b.gpkg", "b.gpkg: no such file"),
-        ("- cloud", "holds no keys"),
-        ("just words", "holds no keys"),
-        ("a: [", "no valid YAML"),
-        (b"\xff\xfe\x00", "no valid YAML"),
-        (bytes(100), "no valid YAML"),
-        ("[" * 800, "no valid YAML"),
-        ("settle: " + "9" * 5000, ""),
-        ("&a {settings: *a, overrides: {A: *a}}", ""),
-        ("parcels: 5", "parcels = 5"),
-        ("parcels: [5]", "put it in quotes"),
-        ("overrides: 5", "overrides = 5"),
-        ("settings: {polygon: 5}", "settings.polygon = 5"),
-    ],
-)
-def test_its_own_file_is_wrong(clouds, place, own, said):
-    """Named, and no other survey's concern."""
-    put(clouds["laz 1.4"], place / "may" / "a.laz", place / "june.laz")
-    (place / "may" / "survey.yaml").write_bytes(own if isinstance(own, bytes) else own.encode())
-    options = {"overrides": {"A": {"origin": [44, 7, 100]}}}
-    path = place.parent / "estate.yaml"
-    path.write_text(f"surveys: {place}\noverrides: {{A: {{origin: [44, 7, 100]}}}}\n")
-    june, may = arrivals(load_estate(path), now=NOW)
-    assert june.config.overrides.keys() == options["overrides"].keys()
-    assert may.config is None
-    assert not may.waits
-    assert str(place / "may") in may.reason
-    assert said in may.reason
-    assert "\n" not in may.reason
-    assert len(may.reason) < 1000
-
-
-def test_a_folder_in_the_place_of_its_own_file(clouds, place):
-    put(clouds["laz 1.4"], place / "may" / "a.laz")
-    (place / "may" / "survey.yaml").mkdir()
-    assert found(place)[0].config
-
-
-def test_its_own_file_alone(place):
-    (place / "may").mkdir()
-    (place / "may" / "survey.yaml").touch()
-    assert reasons(place) == {"may": f"{place / 'may'}: holds no cloud, and its survey.yaml names none"}
-
-
-def test_what_holds_for_all_surveys(clouds, place):
-    put(clouds["laz 1.4"], place / "may.laz", place / "june" / "a.laz", place / "july" / "a.laz")
-    polygons(place / "july" / "own.gpkg")
-    shared = polygons(place.parent / "shared.gpkg")
-    (place / "june" / "survey.yaml").write_text("parcels: [A]\ncrs: EPSG:32633\n")
-    path = place.parent / "estate.yaml"
-    path.write_text(
-        f"surveys: {place}\nboundaries: {shared}\ncrs: EPSG:32632\nsettings: {{polygon: {{c: 9}}}}\n"
-        "overrides: {A: {settings: {fit: {smoothing: 5}}}, B: {origin: [44, 7, 100]}}\n"
-    )
-    july, june, may = (arrival.config for arrival in arrivals(load_estate(path), now=NOW))
-    assert july.boundaries == place / "july" / "own.gpkg"
-    assert may.boundaries == june.boundaries == shared
-    assert (may.crs, june.crs) == ("EPSG:32632", "EPSG:32633")
-    assert list(june.overrides) == ["A"]
-    assert list(may.overrides) == ["A", "B"]
-    own = june.of_parcel("A").settings
-    assert (own.polygon.c, own.fit.smoothing) == (9, 5)
 
 
 @POSIX
