@@ -13,7 +13,7 @@ from pyproj import CRS
 from vinemap.errors import InputError
 from vinemap.geo.crs import LOCAL
 from vinemap.geo.layers import read_points
-from vinemap.geo.lines import read_rows, rows_of
+from vinemap.geo.lines import as_rows, read_rows, rows_of
 
 UTM = CRS.from_epsg(32632)
 LINES = [shapely.LineString([(428000, 4940000 + 3 * k), (428030, 4940001 + 3 * k)]) for k in range(4)]
@@ -140,8 +140,27 @@ def test_what_is_no_row_is_left_out_and_told(tmp_path):
         "a.gpkg holds what is no row, and is left out: a line that is there twice 'again', a Point 'post', an empty "
         "geometry 'none', a line of no length 'click', a line that crosses itself 'loop'"
     )
-    with pytest.raises(InputError, match="holds no line, and no two points of one name"):
+    with pytest.raises(InputError, match="holds no line, and no two points of one name, but a Point: give"):
         read_rows(write(tmp_path / "b.gpkg", [odd["post"]], name=["post"]))
+
+
+def test_parts_of_a_line_are_one_row_or_several(tmp_path):
+    """One after the other, in whatever order and sense, they are one; side by side, as in dissolved layers, several."""
+    (x, y), _ = LINES[0].coords
+    parts = [[(x + 20, y), (x + 30, y)], [(x + 8, y), (x, y)], [(x + 10, y), (x + 18, y)]]
+    known = read_rows(write(tmp_path / "parts.gpkg", [shapely.MultiLineString(parts)], name=["a"]))
+    assert known.lines.geometry.iloc[0].equals(shapely.LineString([(x, y), (x + 30, y)]))
+    assert known.lines.geometry.iloc[0].coords[0] == (x, y)
+    dissolved = shapely.MultiLineString([LINES[0], LINES[1].reverse(), LINES[2]])
+    path = write(tmp_path / "dissolved.gpkg", [LINES[3], dissolved], row=[9, 4])
+    assert told(path)[0] == [(9, "9 F"), (4, "4 F"), (10, "10 F"), (11, "11 F")]
+    assert [*read_rows(path).lines.length.round()] == [30] * 4
+    assert as_rows([dissolved]) == ["a line of parts side by side"]
+
+
+def test_numbers_of_any_script_and_length(tmp_path):
+    rows = told(write(tmp_path / "a.gpkg", row=["٣", "9" * 5000, "07", "²"]))[0]
+    assert [number for number, _ in rows] == [3, 8, 7, 9]
 
 
 def test_posts_of_one_name_are_a_row(tmp_path):

@@ -82,7 +82,8 @@ def read_rows(path: Path, *, crs: CRS | None = None, local: bool = False) -> Kno
         If the file can't be read, has no CRS or no row, or more than one layer that may be meant.
     """
     table = read_layers(path, partial(_row_layers, path), "rows", drawn=True, crs=crs, local=local)
-    lines = [_as_row(shape) for shape in table.geometry]
+    shapes = [(k, p) for k, s in enumerate(table.geometry) for p in (shapely.get_parts(s) if _are_abreast(s) else [s])]
+    table, lines = table.iloc[[k for k, _ in shapes]].reset_index(drop=True), [_as_row(shape) for _, shape in shapes]
     if path.suffix.lower() == ".dxf":
         of = table["Layer"].astype(str).where([isinstance(line, shapely.LineString) for line in lines])
         drawn = [Layer(str(path), name, "LineString") for name in dict.fromkeys(of.dropna())]
@@ -129,8 +130,8 @@ def as_rows(shapes: Sequence[BaseGeometry | None]) -> list[Row]:
 def _as_row(shape: BaseGeometry | None) -> Row:
     """The line of a row in plan, or what there is instead, in words."""
     parts = [shapely.force_2d(p) for p in parts_of(shape) if isinstance(p, shapely.LineString) and not p.is_empty]
-    if not parts:
-        return kind_of(shape)
+    if not parts or _are_abreast(shape):
+        return "a line of parts side by side" if parts else kind_of(shape)
     if not all(np.isfinite(shapely.get_coordinates(part)).all() for part in parts):
         return "a line with coordinates that are no numbers"
     line = shapely.remove_repeated_points(_joined(parts))
@@ -139,13 +140,22 @@ def _as_row(shape: BaseGeometry | None) -> Row:
     return line if line.is_simple and not line.is_closed else "a line that crosses itself"
 
 
+def _are_abreast(shape: BaseGeometry | None) -> bool:
+    """Whether a line has parts side by side, which are rows of their own, rather than one after the other."""
+    parts = shapely.get_parts(shape if isinstance(shape, shapely.MultiLineString) else None)
+    longest = max(parts, key=shapely.length, default=shapely.LineString())
+    place = shapely.line_locate_point(longest, shapely.line_interpolate_point(parts, 0.5, normalized=True))
+    return bool(((place > 0) & (place < longest.length) & (parts != longest)).any())
+
+
 def _joined(parts: Sequence[shapely.LineString]) -> shapely.LineString:
-    """Parts of a line, one after the other, each from the end at which the one before it stopped."""
-    found = shapely.get_coordinates(parts[0])
-    for part in parts[1:]:
-        xy = shapely.get_coordinates(part)
-        near, far = np.hypot(*(xy[[0, -1]] - found[-1]).T)
-        found = np.concatenate([found, xy if near <= far else xy[::-1]])
+    """Parts of a line, one after the other in whatever order they come, in the sense of the first one."""
+    found, *left = (shapely.get_coordinates(part) for part in parts)
+    while left:
+        ways = [np.hypot(*(xy[e] - found[f])) for xy in left for f, e in ((-1, 0), (-1, -1), (0, 0), (0, -1))]
+        k, way = divmod(int(np.argmin(ways)), 4)
+        xy = left.pop(k)[:: 1 if way in (0, 3) else -1]
+        found = np.concatenate([found, xy] if way < 2 else [xy, found])
     return shapely.LineString(found)
 
 
@@ -170,13 +180,13 @@ def _named(columns: Mapping[str, pd.Series], places: list[int]) -> pd.DataFrame:
     )
     names = names.where(names.notna(), numbers.where(~numbers.map(_is_number), None))
     numbers = numbers if numbers.map(_is_number).any() else names
-    number = pd.to_numeric(numbers.where(numbers.map(_is_number), None)).astype("Int64")
+    number = pd.Series([int(word) if _is_number(word) else None for word in numbers], dtype="Int64")
     return pd.DataFrame({"row_id": number, "label": names.where(names.notna(), None)})
 
 
 def _is_number(word: object) -> bool:
     """Whether a word is a number that a row can have."""
-    return isinstance(word, str) and word.isdecimal() and 0 < int(word) <= LAST_NUMBER
+    return isinstance(word, str) and word.isdecimal() and len(word) < 20 and 0 < int(word) <= LAST_NUMBER
 
 
 def _rows_of_posts(
@@ -189,9 +199,10 @@ def _rows_of_posts(
         lines = [_through(np.array([xy for k in row for xy in points[k]]).reshape(-1, 2)) for row in rows]
         if any(isinstance(line, shapely.LineString) for line in lines):
             return _named(columns, [row[0] for row in rows]), lines
+    there = some_of([*dict.fromkeys(str(_as_row(shape)) for shape in table.geometry)]) or "nothing"
     raise InputError(
-        f"{path}: holds no line, and no two points of one name: give the first and last post of a row its name, in a "
-        "column 'row'"
+        f"{path}: holds no line, and no two points of one name, but {there}: give the first and last post of a row its "
+        "name, in a column 'row'"
     )
 
 
