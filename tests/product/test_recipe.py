@@ -18,7 +18,7 @@ from vinemap.errors import BusyError, InputError
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.main import Origin
 from vinemap.product import recipe
-from vinemap.product.recipe import Source, flown, product_in, read_source, recipe_of
+from vinemap.product.recipe import Source, flown, product_in, read_source, recipe_of, vines_of
 
 PLACE = np.array([414_700.0, 4_940_700.0])
 
@@ -137,6 +137,20 @@ def test_known_vines_of_the_parcel_are_in_the_key(made, cloud, boundaries, tmp_p
     assert len({made.key, alone, key(inside[:1])}) == 3
     with pytest.raises(InputError, match=r"none of its vines stands in the parcel: is its CRS the right one\?"):
         key([(x + 500, y)])
+
+
+def test_vines_stand_in_parcels_or_half_a_metre_beside(made):
+    """Whatever their CRS: in degrees a half would be all of a country."""
+    (x, y, *_), utm = made.boundary[0].bounds, made.boundary[1]
+    points = gpd.GeoSeries(gpd.points_from_xy([x + 1, x - 0.4, x - 0.6, x + 900], [y + 1] * 4), crs=utm).to_crs(4326)
+    outline = gpd.GeoSeries([made.boundary[0]], crs=utm).to_crs(4326)
+    parcels = {"metres": made.boundary, "degrees": (outline[0], outline.crs), "all": None}
+    found = vines_of(points, parcels)
+    assert {name: [*own.index] for name, own in found.items()} == {
+        "metres": [0, 1],
+        "degrees": [0, 1],
+        "all": [*range(4)],
+    }
 
 
 def test_the_key_tells_nothing_else(made, cloud, boundaries, tmp_path):

@@ -13,14 +13,16 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import LOCAL, WGS84, is_local, project
+from vinemap.geo.crs import LOCAL, WGS84, is_local, metric_crs, project
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from pyproj import CRS
     from shapely.geometry.base import BaseGeometry
+
+    from vinemap.geo.boundaries import Boundary
 
 KML = (".kml", ".kmz")
 """Files whose folders are layers."""
@@ -133,10 +135,38 @@ def read_points(path: Path, things: str, *, crs: CRS | None = None, local: bool 
     return gpd.GeoSeries(shapely.points(xy), crs=table.crs)
 
 
-def points_near(points: gpd.GeoSeries, polygon: shapely.Geometry, crs: CRS, *, reach: float) -> gpd.GeoSeries:
-    """Those of some points that lie in a polygon, or within metres of it; the polygon's CRS is given."""
-    brought = project(points.to_numpy(), points.crs, crs)
-    return points[shapely.dwithin(brought, polygon, reach)]
+def points_near(
+    points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
+) -> dict[str, gpd.GeoSeries]:
+    """Those of some points that lie within each boundary, or no more than so many metres beside it.
+
+    Parameters
+    ----------
+    points : GeoSeries
+        Points in any CRS.
+    boundaries : mapping of str to Boundary
+        By the parcels' names; None is everywhere.
+    reach : float
+        Metres.
+
+    Raises
+    ------
+    InputError
+        If a boundary doesn't lie in its CRS, or nothing leads to that from the points'.
+    """
+    found: dict[str, gpd.GeoSeries] = {}
+    brought: dict[CRS, shapely.STRtree] = {}
+    for name, boundary in boundaries.items():
+        if not boundary:
+            found[name] = points
+            continue
+        polygon, own = boundary
+        crs = metric_crs(own, *shapely.get_coordinates(shapely.point_on_surface(polygon))[0])
+        if crs not in brought:
+            brought[crs] = shapely.STRtree(project(points.to_numpy(), points.crs, crs))
+        near = brought[crs].query(project(polygon, own, crs), predicate="dwithin", distance=reach)
+        found[name] = points.iloc[np.sort(near)]
+    return found
 
 
 def _layers(path: Path, things: str) -> list[Layer]:

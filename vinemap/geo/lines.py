@@ -241,8 +241,9 @@ def rows_of(known: KnownRows, parcels: Mapping[str, Boundary | None]) -> tuple[d
     owners = known.lines["parcel"].to_numpy() if "parcel" in known.lines else None
     brought: dict[CRS, shapely.STRtree] = {}
     for name, boundary in parcels.items():
-        inside = np.arange(len(known.lines)) if owners is None else np.flatnonzero(owners == name)
-        if boundary:
+        if not boundary:
+            inside = np.arange(len(known.lines)) if owners is None else np.flatnonzero(owners == name)
+        else:
             polygon, crs = boundary
             if crs not in brought:
                 brought[crs] = shapely.STRtree(project(known.lines.geometry.to_numpy(), known.lines.crs, crs))

@@ -187,7 +187,7 @@ def _known_vines(
     if path is None:
         return {}, []
     points = read_points(path, VINES, crs=parse_crs(config.rows_crs) if config.rows_crs else None, local=local)
-    known = {name: vines_of(points, boundary) for name, boundary in _bounds(polygons).items()}
+    known = vines_of(points, _bounds(polygons))
     homeless = len(points) - len(set().union(*(own.index for own in known.values())))
     if not homeless or (homeless < len(points) and config.parcels is not None):
         return known, []

@@ -21,7 +21,7 @@ from vinemap.geo.layers import points_near, read_points, some_of
 from vinemap.geo.lines import read_rows, rows_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     import geopandas as gpd
@@ -242,16 +242,16 @@ def recipe_of(
     points = None
     if vines:
         sources += (read_source(vines),)
-        points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), polygon)
+        points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), {parcel: polygon})[parcel]
         if len(points) == 0:
             raise InputError(f"{vines}: none of its vines stands in the parcel: is its CRS the right one?")
     given = settings or Settings(), crs, origin, date, survey, remarks, known, points
     return Recipe(parcel, files, sources, polygon, *given)
 
 
-def vines_of(points: gpd.GeoSeries, boundary: Boundary | None) -> gpd.GeoSeries:
-    """Those of known vines that stand in a parcel, or just beside it, as its boundary may follow its outermost row."""
-    return points_near(points, *boundary, reach=BESIDE) if boundary else points
+def vines_of(points: gpd.GeoSeries, parcels: Mapping[str, Boundary | None]) -> dict[str, gpd.GeoSeries]:
+    """Those of known vines that stand in each parcel, or just beside it, as boundaries may follow outermost rows."""
+    return points_near(points, parcels, reach=BESIDE)
 
 
 def flown(cloud: Source) -> datetime:
