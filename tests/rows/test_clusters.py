@@ -198,6 +198,15 @@ def test_rows_end_at_a_track_that_ends_at_a_road():
     assert_rows_are_kept_apart(cluster_rows(key_points([*rows, *beyond])), 32)
 
 
+def test_rows_that_meet_across_a_road_by_chance_do_not_cross_it():
+    """Two blocks of another spacing: some of the rows beside the gaps have no row to meet."""
+    west = [np.array([[0, 2.0 * k], [30, 2.0 * k]]) for k in range(16)]
+    east = [np.array([[37, 1.7 * k], [60, 1.7 * k]]) for k in range(18)]
+    points = key_points([*west, *east], spacing=2.0)
+    assert_rows_are_kept_apart(cluster_rows(points), 34)
+    assert cluster_rows(points, track_width=50)["cluster"].nunique() < 26
+
+
 @pytest.mark.parametrize("first", [4, 12])
 def test_a_bare_strip_that_ends_within_a_field_is_no_track(first):
     """All rows from one on to the last lack 5 m."""

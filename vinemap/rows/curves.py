@@ -35,8 +35,9 @@ BESIDE = 1.3
 """Spacings within which a row runs beside another."""
 AMONG = 4
 """Rows to either side among which a row stands: blocks differ."""
-LEAST_AMOUNT, MOST_WIDTH = 0.15, 1.8
-"""Canopy and width of a row, in those of the typical one among which it stands."""
+LEAST_AMOUNT, MOST_WIDTH, SLIM = 0.15, 1.8, 0.3
+"""Canopy and width of a row, in those of the typical one among which it stands, and width in its spacing that none is
+too wide for."""
 SPARSE = 0.65
 """Share of the length on which most rows have canopy, as bushes that stand apart do, from which one is a row."""
 CLOSED = 0.9
@@ -238,15 +239,16 @@ def _like_the_others(rows: gpd.GeoDataFrame) -> Flags:
     enclosed = _enclosed(rows, pairs)
     beside = eye_array(len(rows), format="csr") + coo_array((np.ones(len(pairs)), pairs.T), shape=(len(rows),) * 2)
     near = matrix_power(beside, AMONG)
-    length, amount, width = (np.asarray(v) for v in (rows.length, rows["amount"], rows["width"]))
+    length, amount, width, spacing = (
+        np.asarray(v) for v in (rows.length, rows["amount"], rows["width"], rows["spacing_m"])
+    )
     for k in range(len(rows)):
         others = near.indices[near.indptr[k] : near.indptr[k + 1]]
         if len(others) < 3:
             continue
         typical = others[_typical(amount[others], length[others])]
-        out[k] = amount[k] >= LEAST_AMOUNT * amount[typical] and (
-            enclosed[k] or width[k] <= MOST_WIDTH * width[typical]
-        )
+        widest = max(MOST_WIDTH * width[typical], SLIM * spacing[k])
+        out[k] = amount[k] >= LEAST_AMOUNT * amount[typical] and (enclosed[k] or width[k] <= widest)
     return out
 
 

@@ -113,15 +113,20 @@ def _in_frame(gaps: Gaps, one: Ints, other: Ints) -> tuple[Values, Values]:
 def _leads_out(tree: cKDTree, gaps: Gaps, lane: Ints, track_width: float) -> bool:
     """Whether open ground leads out of the field on both sides of gaps side by side, and through all but a few rows."""
     first = np.broadcast_to(lane[0], len(lane))
-    y = _in_frame(gaps, first, lane)[1]
+    x, y = _in_frame(gaps, first, lane)
     last = lane[[y.argmin(), y.argmax()]]
     ways = (-1, 1) * np.where(gaps.along[last] @ gaps.along[lane[0]] < 0, -1, 1)
     stopped, beyond = np.transpose(
         [_beyond(tree, gaps, k, way, track_width) for k, way in zip(last, ways, strict=True)]
     )
     within = round(float(np.ptp(y)))
-    through = within + 1 - len(np.unique(np.rint(y - y.min())))
     rows = beyond.sum() + within
+    others = np.setdiff1d(np.arange(within + 1), np.rint(y - y.min())) + y.min()
+    order = np.argsort(y)
+    along, spacing = gaps.along[lane[0]], gaps.spacing[lane[0]]
+    aside = others * spacing * np.array([[-along[1]], [along[0]]])
+    places = gaps.middle[lane[0]] + np.interp(others, y[order], x[order])[:, None] * along + aside.T
+    through = np.count_nonzero(tree.query(places)[0] < min(track_width / 2, OPEN * spacing)) if len(others) else 0
     return bool(rows > 1 and (stopped == 0).all() and through <= (1 - MOST) * rows)
 
 
