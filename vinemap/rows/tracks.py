@@ -22,6 +22,8 @@ ACROSS = 6
 """Rows on each side of a gap that are looked at for a track."""
 MOST = 0.8
 """Share of the rows that a track crosses, of those from where it comes into the field to where it leaves it."""
+EDGE = 1
+"""Rows beyond gaps side by side that may go on: the field goes on where more do, but a hedge may stand along it."""
 APART = 1.2
 """Spacings to the next row beyond which a field ends."""
 NEXT = 3.5
@@ -127,7 +129,7 @@ def _leads_out(tree: cKDTree, gaps: Gaps, lane: Ints, track_width: float) -> boo
     aside = others * spacing * np.array([[-along[1]], [along[0]]])
     places = gaps.middle[lane[0]] + np.interp(others, y[order], x[order])[:, None] * along + aside.T
     through = np.count_nonzero(tree.query(places)[0] < min(track_width / 2, OPEN * spacing)) if len(others) else 0
-    return bool(rows > 1 and (stopped == 0).all() and through <= (1 - MOST) * rows)
+    return bool(rows > 1 and stopped.max() <= EDGE and stopped.sum() + through <= (1 - MOST) * rows)
 
 
 def _beyond(tree: cKDTree, gaps: Gaps, k: int, way: int, track_width: float) -> tuple[int, int]:
