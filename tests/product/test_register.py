@@ -185,6 +185,42 @@ def test_what_is_no_row_is_left_out_and_not_lost(path):
     assert said == ["what is no row in the register is left out: a line that crosses itself '2 F'"]
 
 
+def executed(path, *statements):
+    """Change a register by SQL, past what QGIS would allow."""
+    database = sqlite3.connect(path, isolation_level=None)
+    for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+        database.execute(f'DROP TRIGGER "{name}"')
+    for statement in statements:
+        database.execute(statement)
+    database.close()
+
+
+def test_what_is_no_date_is_none_and_told(path):
+    """Else the row would be left out of all surveys."""
+    executed(
+        path, "UPDATE rows SET planted = 'last year' WHERE uid = 1", "UPDATE rows SET grubbed = '1/2/25' WHERE uid = 2"
+    )
+    rows = settle(read_register(path), "2026-07-01", {}).rows
+    assert rows[["planted", "grubbed"]].isna().all(axis=None)
+    labels, past, said = night(path)
+    assert (labels, past) == (FIVE, [])
+    odd = "planted 'last year' of 1 F, grubbed '1-2-25' of 2 F"
+    assert said == [f"dates of the register that are none count as empty: {odd}: write them as 2026-05-31"]
+
+
+def test_what_others_left_in_its_tables(path):
+    """Candidates of no parcel or date, a past of no row, a table without a key."""
+    executed(
+        path,
+        "INSERT INTO candidates (parcel, flown) VALUES (NULL, '2026-01-01'), ('H', NULL), ('F', '2026-06-10')",
+        "UPDATE history SET uid = NULL WHERE uid = 10",
+    )
+    assert read_register(path).offered == {"F": "2026-06-10"}
+    assert night(path)[:2] == (FIVE, [(10, "5 G", "drawn")])
+    executed(path, "CREATE TABLE other AS SELECT * FROM rows", "DROP TABLE rows", "ALTER TABLE other RENAME TO rows")
+    assert len(read_register(path).rows) == 10
+
+
 def test_a_register_that_is_locked_is_left_alone(path, monkeypatch):
     monkeypatch.setattr(file, "PATIENCE", 0.05)
     before = path.read_bytes()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from datetime import date
 from itertools import count
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,6 +69,7 @@ def settle(register: Register, day: str, parcels: Mapping[str, Boundary | None])
     last = past.drop_duplicates("uid", keep="last").set_index("uid")
     usable = are_lines(rows)
     lines: Values = rows["line"].where(usable, None).to_numpy()
+    undated = _without_odd_dates(rows)
     before = rows.drop(columns="line")
     rows["parcel"] = _parcels(rows, lines, register.crs, parcels)
     here = lines if register.crs == register.past_crs else _brought(lines, register)
@@ -80,6 +83,7 @@ def settle(register: Register, day: str, parcels: Mapping[str, Boundary | None])
     left = [_described(row) for row in rows[~usable].itertuples()]
     told = {
         f"what is no row in the register is left out: {some_of(left)}": left,
+        f"dates of the register that are none count as empty: {some_of(undated)}: write them as 2026-05-31": undated,
         f"{len(odd)} rows of the register had another's number or name, and got their own: {some_of(odd)}": odd,
     }
     return Settled(rows, entries, tuple(remark for remark, holds in told.items() if holds))
@@ -88,6 +92,22 @@ def settle(register: Register, day: str, parcels: Mapping[str, Boundary | None])
 def are_lines(rows: pd.DataFrame) -> NDArray[np.bool_]:
     """Which rows (n,) of a register have a line."""
     return np.array([isinstance(line, shapely.LineString) for line in rows["line"]], dtype=bool)
+
+
+def _without_odd_dates(rows: pd.DataFrame) -> list[str]:
+    """Leave out, in place, what are no dates of planting and grubbing; which those are, and of which rows."""
+    odd: list[str] = []
+    for column in DATES[HISTORY][:2]:
+        wrong = rows.index[[day is not None and not _is_date(day) for day in rows[column]]]
+        odd += [f"{column} {rows[column][k]!r} of {rows['label'][k] or 'a new row'}" for k in wrong]
+        rows.loc[wrong, column] = None
+    return odd
+
+
+def _is_date(word: str) -> bool:
+    with suppress(ValueError):
+        return f"{date.fromisoformat(word)}" == word
+    return False
 
 
 def _brought(lines: Values, register: Register) -> Values:

@@ -220,7 +220,7 @@ def _layer(database: sqlite3.Connection, layer: str, path: Path) -> tuple[str, C
         crs = CRS.from_authority(authority, number) if authority.upper() == "EPSG" else CRS.from_user_input(words)
     except CRSError as error:
         raise InputError(f"{path}: its layer {layer} has no CRS: set it in QGIS") from error
-    return column, crs, next(name for name, key in columns if key)
+    return column, crs, next((name for name, key in columns if key), "rowid")
 
 
 def _read(database: sqlite3.Connection, path: Path) -> Register:
@@ -231,8 +231,10 @@ def _read(database: sqlite3.Connection, path: Path) -> Register:
     past, past_crs = _table(database, HISTORY, path)
     offered: dict[str, str] = {}
     if "flown" in _columns(database, CANDIDATES):
-        offered = dict(database.execute("SELECT parcel, max(flown) FROM candidates GROUP BY parcel"))
-    return Register(crs, rows, past_crs, past.sort_values("fid", ignore_index=True), offered)
+        found = database.execute("SELECT parcel, max(flown) FROM candidates GROUP BY parcel").fetchall()
+        offered = {parcel: day for parcel, flown in found if parcel is not None and (day := _date(flown))}
+    past = past[past["uid"].notna()].sort_values("fid", ignore_index=True)
+    return Register(crs, rows, past_crs, past, offered)
 
 
 def _table(database: sqlite3.Connection, layer: str, path: Path) -> tuple[pd.DataFrame, CRS]:
