@@ -206,8 +206,9 @@ def test_known_vines_that_stand_in_no_row_are_told():
     assert remarks == [f"{lost} of {n} {words}"]
     _, remarks = vines_in_rows(surveyed(rows, shift=(0, 0.8)), told[0])
     assert [remark.split(",")[0] for remark in remarks] == [
-        "half of the known vines stand 0.80 m or more aside of their rows"
+        "half of the known vines in rows stand 0.80 m or more aside of them"
     ]
+    assert vines_in_rows(surveyed(rows, shift=(0, 500)), told[0]) == ({}, [f"{n - lost - 1} of {n - lost - 1} {words}"])
     assert vines_in_rows(surveyed(rows), told[0][:0])[0] == {}
     assert vines_in_rows(None, told[0]) == ({}, [])
 

@@ -64,12 +64,12 @@ def vines_in_rows(
     stands &= beyond <= (apart or 0.0) / 2
     vines = {k: np.sort(position[stands & (row == k)]) for k in np.unique(row[stands]).tolist()}
     lost = len(xy) - int(stands.sum())
-    off = float(np.median(away[stands])) if stands.any() else 0.0
+    off, doubt = (float(np.median(one[stands])) if stands.any() else 0.0 for one in (away, share))
     remarks = {
         f"{lost} of {len(xy)} known vines stand farther than half a spacing from any row, or beyond its ends, and are "
         "left out": lost > 0,
-        f"half of the known vines stand {off:.2f} m or more aside of their rows, and may be the next rows'; give known "
-        "rows from the same survey (--rows), or look whether the CRS is right": bool(np.median(share) > ASIDE),
+        f"half of the known vines in rows stand {off:.2f} m or more aside of them, and may be the next rows'; give "
+        "known rows from the same survey (--rows), or look whether the CRS is right": doubt > ASIDE,
     }
     return vines, [remark for remark, holds in remarks.items() if holds]
 
