@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from vinemap.canopy.numbers import lengths_of, summarise_rows
-from vinemap.evaluate.planting import Edges, estimate_spacing
+from vinemap.evaluate.planting import Edges, estimate_spacing, place_vines
 from vinemap.evaluate.shift import Shift
 from vinemap.evaluate.trunks import vines_in_rows
 from vinemap.evaluate.vines import find_vines
@@ -159,6 +159,16 @@ def test_canopies_of_vines_add_up_to_their_rows_and_weak_ones_are_told():
     assert (gone["volume_m3"] == 0).all()
     assert gone["height_m"].isna().all()
     assert out["n_missing"].sum() == len(gone)
+
+
+@pytest.mark.parametrize("length", [0.5, 1.08, 1.1, 2.0])
+def test_rows_no_longer_than_a_vine_have_one(length):
+    """Though the block's other rows tell of vines of just that extent."""
+    edges = [Edges(length, np.array([length]), np.zeros(1)), Edges(20.08, np.array([20.08]), np.zeros(1))]
+    places = place_vines(edges, 1.0, 1.08)
+    assert np.bincount(places.row).tolist() == [round(max(length - 1.08, 0)) + 1, 20]
+    assert ((places.position >= 0) & (places.position <= np.array([length, 20.08])[places.row])).all()
+    assert np.isfinite(places.deviation).all()
 
 
 def surveyed(rows, *, shift=(0.0, 0.0)):

@@ -201,8 +201,9 @@ def _fit(rows: Sequence[Edges], length: Values, spacing: float, extent: float, *
     steps = np.maximum((length - extent) / spacing, 0.0)
     loose = (OWN / np.maximum(steps, 1.0) + 0.003) * spacing
     count = np.maximum(np.rint(steps) + np.array([-1, 0, 1]), 0)
-    apart = np.where(count > 0, (length - extent) / np.maximum(count, 1), spacing)
-    start = np.where(count > 0, extent / 2, length / 2)
+    several = (count > 0) & (length > extent)
+    apart = np.where(several, (length - extent) / np.maximum(count, 1), spacing)
+    start = np.where(several, extent / 2, length / 2)
     for _ in range(STEPS):
         number = np.rint((told - start[..., None]) / apart[..., None])
         off = (told - start[..., None] - number * apart[..., None]) / sigma
