@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import shapely
 
-from vinemap.rows.blocks import group_blocks, outline_blocks
+from vinemap.rows.blocks import flag_rows, group_blocks, outline_blocks
 from vinemap.rows.numbers import count_missing, estimate_vine_spacing
 
 
@@ -94,3 +94,9 @@ def test_no_order_no_vine_spacing():
     rows = rows_frame(parallel(15, 0, np.array([0, 0])), row_id=np.arange(1, 16))
     assert count_missing(rows, gaps)[0]["vine_spacing_m"].iloc[0] == 1.0
     assert count_missing(rows, gaps, vine_spacing=1.3)[0]["vine_spacing_m"].iloc[0] == 1.3
+
+
+def test_known_rows_that_cross_each_other_are_odd():
+    lines = [[(0, 0), (30, 0)], [(0, 3), (30, 3)], [(0, -1), (30, 4)]]
+    rows = rows_frame(lines, block=1, support=1.0, cut=0.0)
+    assert flag_rows(rows)["flags"].tolist() == ["spacing"] * 3

@@ -108,7 +108,7 @@ def flag_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         away = shapely.distance(simple[:, None], simple[None, :])
         np.fill_diagonal(away, np.inf)
         nearest = away.min(axis=1)
-        ratio = nearest / np.median(nearest)
+        ratio = nearest / max(float(np.median(nearest)), 1e-9)
         bow = np.array([_bow(line) for line in mine])
         beside = np.argsort(away, axis=1)[:, :4]
         expected = np.median(bow[beside] * (length[index, None] / length[index][beside]) ** 2, axis=1)
