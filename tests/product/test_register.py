@@ -1,6 +1,7 @@
 """The register of an estate: what is edited in it by hand, whose number stays whose, and what can be wrong with it."""
 
 import sqlite3
+from pathlib import PureWindowsPath
 
 import geopandas as gpd
 import numpy as np
@@ -219,6 +220,11 @@ def test_what_others_left_in_its_tables(path):
     assert night(path)[:2] == (FIVE, [(10, "5 G", "drawn")])
     executed(path, "CREATE TABLE other AS SELECT * FROM rows", "DROP TABLE rows", "ALTER TABLE other RENAME TO rows")
     assert len(read_register(path).rows) == 10
+
+
+def test_a_register_on_a_share_of_windows():
+    assert file._uri(PureWindowsPath(r"\\nas\vines\my rows.gpkg")) == "file:////nas/vines/my%20rows.gpkg"
+    assert file._uri(PureWindowsPath("C:/vines/rows.gpkg")) == "file:///C:/vines/rows.gpkg"
 
 
 def test_a_register_that_is_locked_is_left_alone(path, monkeypatch):

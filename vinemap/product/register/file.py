@@ -29,7 +29,7 @@ from vinemap.product.layers import REAL, TEXT, WHOLE, Layer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     from vinemap.compute.arrays import Values
 
@@ -185,7 +185,7 @@ def _opened(path: Path, *, write: bool = False) -> Iterator[sqlite3.Connection]:
     if not path.is_file():
         raise InputError(f"{path}: no such file: vinemap register makes it of products")
     try:
-        place = f"{path.resolve().as_uri()}?mode={'rw' if write else 'ro'}"
+        place = f"{_uri(path.resolve())}?mode={'rw' if write else 'ro'}"
         with closing(sqlite3.connect(place, uri=True, timeout=PATIENCE, isolation_level=None)) as database:
             database.execute("BEGIN IMMEDIATE" if write else "BEGIN")
             yield database
@@ -199,6 +199,12 @@ def _opened(path: Path, *, write: bool = False) -> Iterator[sqlite3.Connection]:
         if code in UNWRITABLE:
             raise OutputError(f"{path}: can't be written ({error}): the register stays as it was") from error
         raise InputError(f"{path}: can't be read as a register ({error}): put a copy back, or move it away") from error
+
+
+def _uri(path: PurePath) -> str:
+    """A path as SQLite takes it, which knows no host: a share of Windows is a path of two slashes."""
+    uri = path.as_uri()
+    return uri if uri.startswith("file:///") else uri.replace("file://", "file:////", 1)
 
 
 def _columns(database: sqlite3.Connection, layer: str) -> set[str]:
