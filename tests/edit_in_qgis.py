@@ -11,7 +11,7 @@ import sys
 from qgis.core import QgsApplication, QgsFeature, QgsFeatureRequest, QgsGeometry, QgsPointXY, QgsVectorLayer
 from qgis.PyQt.QtCore import QDate
 
-application = QgsApplication([], False)  # noqa: FBT003 - as it wants it
+application = QgsApplication([], GUIenabled=False)
 application.initQgis()
 layer = QgsVectorLayer(f"{sys.argv[1]}|layername=rows", "rows", "ogr")
 

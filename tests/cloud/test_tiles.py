@@ -253,8 +253,8 @@ def test_product_of_a_cloud_in_tiles(tmp_path, survey, small_tiles):
 
     classified = IN_TILES.product.model_copy(update={"classified": True})
     for name, settings in (("whole", Settings()), ("tiled", IN_TILES)):
-        settings = settings.model_copy(update={"product": classified})  # noqa: PLW2901
-        map_parcel(survey, tmp_path / name, parcel="A", boundary=boundary, settings=settings, step=step)
+        own = settings.model_copy(update={"product": classified})
+        map_parcel(survey, tmp_path / name, parcel="A", boundary=boundary, settings=own, step=step)
     assert len(seen) > 9
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiled", "whole"]
     whole, tiled = (sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("whole", "tiled"))

@@ -8,14 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
+from selenium.webdriver import Chrome, ChromeOptions
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
 from vinemap import paths
-
-selenium = pytest.importorskip("selenium", reason="needs selenium")
-from selenium.webdriver import Chrome, ChromeOptions  # noqa: E402
-from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
 
 FLAGS = """--headless=new --no-sandbox --disable-quic --no-first-run --disable-background-networking
     --disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader""".split()
