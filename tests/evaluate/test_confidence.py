@@ -107,8 +107,8 @@ def test_a_row_whose_canopy_is_cut_is_at_an_edge_and_less_sure(voids, cut):
     found, whole = (believed(judged(block(5), voids=cut_by), NO_GAPS)[0] for cut_by in (voids, ()))
     assert found["cut"].iloc[0] == pytest.approx(cut, abs=0.05)
     assert found["flags"].tolist() == ["edge" if cut else "", "", "", "", ""]
-    lower = whole["confidence"].iloc[0] - found["confidence"].iloc[0]
-    assert lower > 0.08 if cut > 0.9 else lower > 0.003 if cut else abs(lower) < 0.02
+    odds, before = (np.log(one["confidence"] / (1 - one["confidence"])).iloc[0] for one in (found, whole))
+    assert before - odds == pytest.approx(2 * cut, abs=0.1)  # e² times less, where all of it is cut
     assert found["confidence"].iloc[1:].to_numpy() == pytest.approx(whole["confidence"].iloc[1:].to_numpy(), abs=0.02)
 
 
