@@ -51,13 +51,13 @@ def shared():
     return SHARED
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def clouds(tmp_path_factory):
     """A whole file of each kind."""
     return write_each(tmp_path_factory.mktemp("clouds"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def three(tmp_path_factory):
     """Three small parcels; in ``more.gpkg`` beside them one that shares its points with A, and one without any."""
     place = np.mean(rows_of(1)[0], axis=0)

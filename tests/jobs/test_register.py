@@ -6,6 +6,7 @@ import sqlite3
 import geopandas as gpd
 import pyogrio
 import pytest
+from products import map_here
 
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError
@@ -21,7 +22,7 @@ def mapped(three, tmp_path_factory):
     """Products of two parcels of a survey, whose rows are sought."""
     given = {"cloud": three, "boundaries": three.with_name("parcels.gpkg"), "parcels": ["A", "B"]}
     folder = tmp_path_factory.mktemp("mapped") / "products"
-    list(map_survey(survey_config(survey="three", **given), folder))
+    map_here(survey_config(survey="three", **given), folder)
     return given, folder
 
 
@@ -38,7 +39,7 @@ def test_a_register_from_night_to_night(survey, monkeypatch):
     config, folder = survey
     path = config.row_register
     # Rows of A are known from now on, those of B are offered and not taken in.
-    outcomes = {one.parcel: one for one in map_survey(config, folder)}
+    outcomes = {one.parcel: one for one in map_here(config, folder)}
     assert {name: one.state for name, one in outcomes.items()} == {"A": DONE, "B": CURRENT, "register": LEFT}
     assert outcomes["register"].reason == (
         f"{path}: 4 rows stand in no register, and are candidates: vinemap register takes them in: B"
