@@ -9,7 +9,7 @@ import shapely
 from vinemap.simulate.families import family
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle, Sheet
-from vinemap.simulate.scenes import rows_in, rows_of
+from vinemap.simulate.scenes import FLIGHTS, estate, rows_in, rows_of
 from vinemap.simulate.survey import simulate
 from vinemap.simulate.terrain import PLACE, hillside
 from vinemap.simulate.yard import posts
@@ -168,3 +168,20 @@ def test_strips_are_half_as_high_and_twice_as_wide_as_their_rows():
     middle = shapely.LineString((np.array(lines[0].coords)[[5, -5]] + np.array(lines[1].coords)[[5, -5]]) / 2)
     near = shapely.contains_xy(middle.buffer(0.15, cap_style="flat"), *survey.xyz[:, :2].T) & (height > 0.2)
     assert np.quantile(height[near], 0.9) == pytest.approx(survey.rows.mean_height.mean() / 2, abs=0.15)
+
+
+def test_flights_of_the_estate_see_the_same_vines_but_for_what_is_told():
+    first, second, third = (estate(flight, density=2) for flight in FLIGHTS)
+    dead = [
+        {(parcel, row): group["vine"].tolist() for (parcel, row), group in one.dead_vines.groupby(["parcel", "row"])}
+        for one in (first, second, third)
+    ]
+    assert dead[0] == {("Bric", 2): [19, 20], ("Conca", 4): [26]}
+    assert dead[1] == dead[2] == dead[0] | {("Bric", 5): [31, 32, 33]}
+    lengths = [one.rows.set_index(["parcel", "row"])["n_vines"] for one in (first, second, third)]
+    assert [of["Bric", 3] for of in lengths] == [41, 41, 45]
+    assert (lengths[0] == lengths[1]).all()
+    assert len(lengths[2]["Costa"]) != len(lengths[0]["Costa"])
+    assert first.parcels.geometry.geom_equals(third.parcels.geometry).all()
+    centres = [one.rows.geometry[0].centroid for one in (first, second, third)]
+    assert centres[0].distance(centres[1]) == pytest.approx(np.hypot(0.24, 0.16), abs=1e-6)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,10 +90,7 @@ def fly(flight: int, folder: Path) -> Flight:
         how["gaps"] = (3,) if mine else ()
         vineyards.append(Vineyard(parcel, list(mine.values()), **how))
     survey = simulate(vineyards, hillside(0.1), name="estate", density=200, seed=flight)
-    cloud = write_survey(survey, folder / "in" / name)
-    with cloud.open("r+b") as stream:  # the date in its header
-        stream.seek(90)
-        stream.write(struct.pack("<HH", day.timetuple().tm_yday, day.year))
+    cloud = write_survey(survey, folder / "in" / name, flown=day)
     boundaries = folder / "in" / "flight 01" / "parcels.gpkg"
     register = folder / "register.gpkg"
     config = survey_config(

@@ -45,7 +45,7 @@ class Vineyard:
     """Share of single dead vines."""
     gaps: Sequence[int] = ()
     """Runs of so many dead vines, dealt to rows at random."""
-    bare: shapely.Polygon | None = None
+    bare: shapely.Polygon | shapely.MultiPolygon | None = None
     """Where all vines are dead but the rows' first and last."""
     outline: shapely.Polygon | None = None
     """Polygon of the parcel; by default 3 m about the hull of the rows. A parcel without rows needs one."""

@@ -1,12 +1,19 @@
-"""Scenes to simulate: shapes of rows, and the example survey."""
+"""Scenes to simulate: shapes of rows, the example survey, and an estate that is flown in three years.
+
+``python -m vinemap.simulate.scenes data/surveys`` writes the three flights of that estate.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import click
 import numpy as np
 import shapely
+import shapely.ops
 from scipy.interpolate import PchipInterpolator
 
 from vinemap import paths
@@ -14,17 +21,17 @@ from vinemap.geo.crs import from_wgs84, parse_crs
 from vinemap.geo.main import Origin, main_to_wgs84
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
-from vinemap.simulate.survey import Survey, simulate
+from vinemap.simulate.survey import Survey, simulate, write_survey
 from vinemap.simulate.terrain import PLACE, hillside, surface_through
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from vinemap.simulate.terrain import Array
 
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6
 """How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
+FLIGHTS = {"2024-05": date(2024, 5, 14), "2025-06": date(2025, 6, 17), "2026-07": date(2026, 7, 7)}
+"""Flights of the estate, and their days."""
 
 
 def rows_of(
@@ -148,3 +155,56 @@ def barolo(
         ],
         seed=seed,
     )
+
+
+def estate(flight: str, *, density: float = 250.0) -> Survey:
+    """An estate of three parcels as one of :data:`FLIGHTS` sees it: what stands there is the same but for what follows.
+
+    Canopies grow. Row 3 of "Bric" lacks its last four vines until 2026, row 2 of it two vines, row 4 of "Conca" one,
+    and row 5 of "Bric" three from 2025 on. "Costa" is planted anew by 2026, closer and in another direction. The later
+    flights lie aside.
+
+    Parameters
+    ----------
+    flight : str
+        Its name.
+    density : float
+        Rays a square metre.
+    """
+    year, (x, y), vine = FLIGHTS[flight].year, PLACE, 0.9
+    height, shift = {2024: (1.2, (0.0, 0.0)), 2025: (1.7, (0.24, -0.16)), 2026: (1.9, (-0.18, 0.13))}[year]
+    bric = rows_of(7, length=45 * vine, azimuth=15, centre=(x, y))
+    conca = rows_of(6, length=38 * vine, radius=60, azimuth=15, centre=(x - 6, y + 24))
+    costa = rows_of(6, length=32 * vine, azimuth=100, centre=(x + 40, y + 22))
+    outlines = [shapely.MultiLineString(rows).convex_hull.buffer(3.0) for rows in (bric, conca, costa)]
+    if year < 2026:
+        end = shapely.LineString(bric[2])
+        bric[2] = np.array(shapely.ops.substring(end, 0, 41 * vine).coords)
+    else:
+        costa = rows_in(outlines[2].buffer(-2.0), spacing=2.2, azimuth=85)
+    lost = [(bric[1], 18, 2), (conca[3], 25, 1), *([(bric[4], 30, 3)] if year > 2024 else [])]
+    bare = [shapely.ops.substring(shapely.LineString(row + shift), k * vine, (k + n) * vine) for row, k, n in lost]
+    gaps = shapely.MultiPolygon(shapely.buffer(bare, 0.3, cap_style="flat").tolist())
+    young = {"height": 0.9, "half_width": 0.18, "bottom": 0.3} if year == 2026 else {"height": height}
+    planted: list[tuple[str, list[Array], dict[str, Any]]] = [
+        ("Bric", bric, {"height": height}),
+        ("Conca", conca, {"height": height}),
+        ("Costa", costa, young),
+    ]
+    vineyards = [
+        Vineyard(name, [row + shift for row in rows], outline=outline, bare=gaps, dead=0.0, vine_spacing=vine, **how)
+        for (name, rows, how), outline in zip(planted, outlines, strict=True)
+    ]
+    return simulate(vineyards, hillside(0.12), name=flight, density=density, seed=year)
+
+
+@click.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+def main(folder: Path) -> None:
+    """Write the flights of the estate, each into a folder of its name in FOLDER, with its parcels and what is true."""
+    for flight, day in FLIGHTS.items():
+        click.echo(f"{day}: {write_survey(estate(flight), folder / flight, flown=day)}")
+
+
+if __name__ == "__main__":
+    main()

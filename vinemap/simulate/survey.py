@@ -158,9 +158,10 @@ def simulate(
     return Survey(name, np.round(np.concatenate(clouds), 3), rows, dead_vines, gaps, parcels, terrain, foliage)
 
 
-def write_survey(survey: Survey, folder: Path | str) -> Path:
+def write_survey(survey: Survey, folder: Path | str, *, flown: date = MADE) -> Path:
     """Write ``<name>.laz``, ``parcels.gpkg`` and ``truth.gpkg`` (layers rows, dead_vines, gaps); return the first.
 
+    ``flown`` is the date that the cloud's header states.
     All three are made aside and then moved into ``folder``, the cloud last, so nothing half-made is ever there.
     """
     import laspy  # only the writer needs it
@@ -170,7 +171,7 @@ def write_survey(survey: Survey, folder: Path | str) -> Path:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(survey.xyz.min(axis=0))
-    header.creation_date = MADE
+    header.creation_date = flown
     header.add_crs(survey.rows.crs)
     cloud = laspy.LasData(header)
     cloud.x, cloud.y, cloud.z = survey.xyz.T
