@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import geopandas as gpd
 import numpy as np
 import shapely
-from affine import Affine
 from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, find_objects, label
 from scipy.spatial import cKDTree
 
@@ -40,6 +39,8 @@ SPECK = 4
 """Cells of what may be noise."""
 PART = 0.25
 """Share of what hangs together below which a part of another kind goes with the rest."""
+STAIRS = 0.75
+"""Cells by which an outline may leave its cells, so that stairs are straight and one row of cells stays one."""
 ROUGH = 0.02
 """Share of a polygon's size by which its outline may be off."""
 CORNERS = np.ones((3, 3))
@@ -246,15 +247,13 @@ def _without_specks(mask: Flags, least: int) -> Flags:
 
 def _polygon(place: Flags, grid: Grid, window: tuple[slice, slice], *, hole: float) -> shapely.MultiPolygon:
     """Outline of cells in a window of a grid, of few vertices, without holes smaller than so many m²."""
-    from rasterio.features import shapes  # a tenth of a second of start-up, needed only here
-
-    west = grid.west + window[1].start * grid.resolution
-    north = grid.north - window[0].start * grid.resolution
-    transform = Affine(grid.resolution, 0, west, 0, -grid.resolution, north)
-    found = shapes(place.astype(np.uint8), mask=place, transform=transform)
-    side = np.count_nonzero(place) ** 0.5 * grid.resolution
-    whole = shapely.multipolygons([shapely.geometry.shape(outline) for outline, _ in found])
-    whole = shapely.simplify(whole, max(grid.resolution, ROUGH * side))
+    cell, (top, left) = grid.resolution, (edge.start for edge in window)
+    change = np.diff(np.pad(place, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
+    x0, x1 = (grid.west + (left + column) * cell for column in (first, last))
+    y0, y1 = (grid.north - (top + row + k) * cell for k in (1, 0))
+    whole = shapely.union_all(shapely.box(x0, y0, x1, y1))
+    whole = shapely.simplify(whole, cell * max(STAIRS, ROUGH * np.count_nonzero(place) ** 0.5))
     kept = [
         shapely.Polygon(part.exterior, [ring for ring in part.interiors if shapely.Polygon(ring).area >= hole])
         for part in shapely.get_parts(whole)
