@@ -12,12 +12,12 @@ import pandas as pd
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import project
+from vinemap.geo.crs import metric_crs, project
 from vinemap.geo.layers import KML, kind_of, parts_of, polygons_of, read_layers, some_of, words_of
 from vinemap.geo.place import check_place
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import geopandas as gpd
@@ -272,6 +272,40 @@ def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
         names = ", ".join(layer.name for layer in found)
         raise InputError(f"{path}: has several layers of polygons ({names}): save the parcels' alone")
     return named or found[:1]
+
+
+def points_near(
+    points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
+) -> dict[str, gpd.GeoSeries]:
+    """Those of some points that lie within each boundary, or no more than so many metres beside it.
+
+    Parameters
+    ----------
+    points : GeoSeries
+        Points in any CRS.
+    boundaries : mapping of str to Boundary
+        By the parcels' names; None is everywhere.
+    reach : float
+        Metres.
+
+    Raises
+    ------
+    InputError
+        If a boundary doesn't lie in its CRS, or nothing leads to that from the points'.
+    """
+    found: dict[str, gpd.GeoSeries] = {}
+    brought: dict[CRS, shapely.STRtree] = {}
+    for name, boundary in boundaries.items():
+        if not boundary:
+            found[name] = points
+            continue
+        polygon, own = boundary
+        crs = metric_crs(own, *shapely.get_coordinates(shapely.point_on_surface(polygon))[0])
+        if crs not in brought:
+            brought[crs] = shapely.STRtree(project(points.to_numpy(), points.crs, crs))
+        near = brought[crs].query(project(polygon, own, crs), predicate="dwithin", distance=reach)
+        found[name] = points.iloc[np.sort(near)]
+    return found
 
 
 def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:

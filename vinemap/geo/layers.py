@@ -13,16 +13,15 @@ import pyogrio
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import LOCAL, WGS84, is_local, metric_crs, project
+from vinemap.geo.crs import LOCAL, WGS84, is_local
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from pyproj import CRS
     from shapely.geometry.base import BaseGeometry
 
-    from vinemap.geo.boundaries import Boundary
 
 KML = (".kml", ".kmz")
 """Files whose folders are layers."""
@@ -133,40 +132,6 @@ def read_points(path: Path, things: str, *, crs: CRS | None = None, local: bool 
     if len(xy) == 0:
         raise InputError(f"{path}: holds no point: {things} are points, one each")
     return gpd.GeoSeries(shapely.points(xy), crs=table.crs)
-
-
-def points_near(
-    points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
-) -> dict[str, gpd.GeoSeries]:
-    """Those of some points that lie within each boundary, or no more than so many metres beside it.
-
-    Parameters
-    ----------
-    points : GeoSeries
-        Points in any CRS.
-    boundaries : mapping of str to Boundary
-        By the parcels' names; None is everywhere.
-    reach : float
-        Metres.
-
-    Raises
-    ------
-    InputError
-        If a boundary doesn't lie in its CRS, or nothing leads to that from the points'.
-    """
-    found: dict[str, gpd.GeoSeries] = {}
-    brought: dict[CRS, shapely.STRtree] = {}
-    for name, boundary in boundaries.items():
-        if not boundary:
-            found[name] = points
-            continue
-        polygon, own = boundary
-        crs = metric_crs(own, *shapely.get_coordinates(shapely.point_on_surface(polygon))[0])
-        if crs not in brought:
-            brought[crs] = shapely.STRtree(project(points.to_numpy(), points.crs, crs))
-        near = brought[crs].query(project(polygon, own, crs), predicate="dwithin", distance=reach)
-        found[name] = points.iloc[np.sort(near)]
-    return found
 
 
 def _layers(path: Path, things: str) -> list[Layer]:

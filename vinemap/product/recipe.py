@@ -15,9 +15,9 @@ from vinemap import __version__, paths
 from vinemap.cloud.files import cloud_files, date_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
-from vinemap.geo.boundaries import read_parcel
+from vinemap.geo.boundaries import points_near, read_parcel
 from vinemap.geo.crs import is_local
-from vinemap.geo.layers import points_near, read_points, some_of
+from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.lines import read_rows, rows_of
 
 if TYPE_CHECKING:
