@@ -57,6 +57,7 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
         confidence(sections_of(width=0.2), height_m=height, width_m=0.2, bottom_m=0.22) for height in (0.5, 0.65, 1.0)
     ]
     assert low == pytest.approx([0.05, 0.56, 1.0], abs=0.01)
+    assert confidence(sections_of(), height_m=1.2, bottom_m=0.5) == pytest.approx(1)  # trunks show beneath it
 
 
 def test_without_a_canopy_there_is_neither_confidence_nor_flag():

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.points import LEAST, NO_SECTIONS, canopy_size
+from vinemap.canopy.points import NO_SECTIONS, above_weeds, canopy_size
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -24,9 +24,8 @@ USUAL_CELLS = 100
 """Cells of a canopy of usual size; a larger one spreads its points over more."""
 TALL = 0.1
 """Share of a section's canopy that must be high."""
-LOWEST, FOOT, UPPER = 0.15, 0.36, 0.5
-"""Metres, and share of a row's height over ``LEAST``, from which its canopy is told from weeds, and share of its height
-from which points are high."""
+UPPER = 0.5
+"""Share of a row's height from which points are high."""
 STICKING, THIN = 1.3, 0.1
 """Height, in the row's own, from which points that spread no more than so many metres across it are a post's."""
 GROUND = 0.3
@@ -82,7 +81,7 @@ def separate_canopy(
         spacing = float(sections.spacing.max())
         top, half = canopy_size(sections.points[:, 0], sections.height, spacing, max_height)
         half_width = half if half_width is None else half_width
-        margin, min_height = min(margin, max(LOWEST, FOOT * (top - LEAST))), min(min_height, UPPER * top)
+        margin, min_height = min(margin, float(above_weeds(top))), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
     limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height, top)

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
+from vinemap.canopy.points import above_weeds
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -31,9 +32,9 @@ DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
 SPREADING = 2.5, 0.8
 """Ratios of width to depth of a canopy whose underside was hardly seen, and of one that hides little of it."""
-LOWLY, HIDDEN = 1.3, (0.45, 0.25)
-"""Metres below which a row's foliage begins no higher than where it is told from weeds, and shares of its height up to
-there, where its numbers are to be doubted, and where they aren't."""
+LOWLY, FOOT, HIDDEN = 1.3, 0.08, (0.45, 0.25)
+"""Metres below which a row is low, and within which of where it is told from weeds its foliage may go on below, and
+shares of its height up to there, where its numbers are to be doubted, and where they aren't."""
 ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
 """Ratio of a row's height or width to the median of its block, or its inverse, and deviations from it, that are odd."""
 FEW, NEARBY = 3, 3.0
@@ -257,7 +258,8 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
     height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
     confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)
-    confidence *= np.where(height < LOWLY, _between(bottom / np.maximum(height, CELL), HIDDEN), 1.0)
+    cut_off = (height < LOWLY) & (bottom < above_weeds(height) + FOOT)
+    confidence *= np.where(cut_off, _between(bottom / np.maximum(height, CELL), HIDDEN), 1.0)
     flags = rows["flags"].tolist()
     groups = _comparable(rows)
     for name, sizes in (("height", height), ("width", width)):

@@ -20,10 +20,18 @@ BIN = 0.05
 """Metres: bins of heights, and across, in which a row's canopy is measured."""
 LEAST, TOP = 0.2, 0.95
 """Metres above which points may be a canopy's, and the order of their heights that is its height."""
+LOWEST, FOOT = 0.15, 0.36
+"""Metres, and share of a row's height over ``LEAST``, from which its canopy is told from weeds."""
 UPPER, EDGE = 0.5, 0.1
 """Share of its height above which a canopy's width is told, and share of its density, from its middle, at its sides."""
 WIDER, BESIDE = 1.5, 0.2
 """By how much, and by how many metres, a canopy may be wider than it is on the whole."""
+
+
+def above_weeds(height: Values | float) -> Values:
+    """Metres above ground from which canopies as high as (n,) are told from weeds."""
+    out: Values = np.maximum(LOWEST, FOOT * (np.asarray(height) - LEAST))
+    return out
 
 
 class Sections(NamedTuple):
