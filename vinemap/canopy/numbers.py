@@ -32,7 +32,7 @@ DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
 SPREADING = 2.5, 0.8
 """Ratios of width to depth of a canopy whose underside was hardly seen, and of one that hides little of it."""
-LOWLY, FOOT, HIDDEN = 1.3, 0.08, (0.45, 0.25)
+LOWLY, ON_WEEDS, HIDDEN = 1.3, 0.08, (0.45, 0.25)
 """Metres below which a row is low, and within which of where it is told from weeds its foliage may go on below, and
 shares of its height up to there, where its numbers are to be doubted, and where they aren't."""
 ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
@@ -258,7 +258,7 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
     height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
     confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)
-    cut_off = (height < LOWLY) & (bottom < above_weeds(height) + FOOT)
+    cut_off = (height < LOWLY) & (bottom < above_weeds(height) + ON_WEEDS)
     confidence *= np.where(cut_off, _between(bottom / np.maximum(height, CELL), HIDDEN), 1.0)
     flags = rows["flags"].tolist()
     groups = _comparable(rows)

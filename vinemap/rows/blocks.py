@@ -5,8 +5,8 @@ from __future__ import annotations
 import geopandas as gpd
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from vinemap.compute.links import parts_of
 
 SAME_DIRECTION = np.radians(20)
 """Radians by which neighbouring rows of one block may differ."""
@@ -50,8 +50,7 @@ def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=NEIGHBOURS * spacing)
     alike = np.abs(np.angle(np.exp(2j * (angle[i] - angle[j])))) / 2 < SAME_DIRECTION
     alike &= np.abs(np.log(spacing[i] / spacing[j])) < np.log(SAME_SPACING)
-    graph = coo_array((np.ones(alike.sum()), (i[alike], j[alike])), shape=(n, n))
-    labels = connected_components(graph, directed=False)[1]
+    labels = parts_of(n, i[alike], j[alike])
     west = np.bincount(labels, weights=ends[:, :, 0].mean(axis=1)) / np.bincount(labels)
     rank = np.empty(len(west), dtype=np.int64)
     rank[np.argsort(west)] = np.arange(1, len(west) + 1)

@@ -19,10 +19,9 @@ from scipy.ndimage import (
     map_coordinates,
     maximum_filter,
 )
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from vinemap.compute.links import parts_of
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
 from vinemap.surfaces.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, scan_cylinders, scan_spectrum
@@ -231,8 +230,7 @@ def _settled(peaks: Peaks, *, least: float) -> Peaks:
     alike = (_axial(direction[one], direction[other]) < ALIKE) & (
         np.abs(np.log(spacing[one] / spacing[other])) < np.log(LIKE_SPACING)
     )
-    graph = coo_array((np.ones(alike.sum()), (one[alike], other[alike])), shape=(my * mx, my * mx))
-    block = connected_components(graph, directed=False)[1]
+    block = parts_of(my * mx, one[alike], other[alike])
     mass, n = np.bincount(block, weights=peaks.strength.ravel()), np.bincount(block, weights=held.ravel())
     strongest = np.zeros(len(mass))  # of the blocks that touch each
     a, b = np.concatenate([block[pairs], block[pairs[:, ::-1]]]).T

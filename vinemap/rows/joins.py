@@ -8,7 +8,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from vinemap.rows.tracks import gaps_between, on_tracks, parts_of
+from vinemap.compute.links import parts_of
+from vinemap.rows.tracks import gaps_between, on_tracks
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -25,7 +26,7 @@ THEREABOUTS, SEVERAL = 25.0, 5
 SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 STRIDE = 0.5
-"""Metres between the places at which ground is looked at."""
+"""Metres between the places of a piece at which it is asked whether it turns."""
 BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
 """Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 OVERLAP = 0.5

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import find_objects, label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from vinemap.compute.links import parts_of
 from vinemap.geo.raster import sample_across
 
 if TYPE_CHECKING:
@@ -26,8 +25,9 @@ EDGE = 1
 """Rows beyond gaps side by side that may go on: the field goes on where more do, but a hedge may stand along it."""
 APART = 1.2
 """Spacings to the next row beyond which a field ends."""
-NEXT = 3.5
-"""Spacings within which gaps are side by side: in a row between them something may stand on a track."""
+NEXT, PARALLEL = 3.5, 0.9
+"""Spacings, and cosine of the angle, within which gaps are side by side: in a row between them something may stand on a
+track."""
 COVERED, LONGER = 0.7, 3.0
 """Share of a gap that another beside it has in common with it, and how much longer than it that may be, to be judged
 with it."""
@@ -100,51 +100,57 @@ def _side_by_side(gaps: Gaps) -> tuple[Ints, Ints, Values]:
     x, y = _in_frame(gaps, one, other)
     half, its = gaps.length[one] / 2, gaps.length[other] / 2
     common = np.minimum(half, x + its) - np.maximum(-half, x - its)
-    parallel = np.abs((gaps.along[one] * gaps.along[other]).sum(axis=1)) > 0.9
+    parallel = np.abs((gaps.along[one] * gaps.along[other]).sum(axis=1)) > PARALLEL
     beside = parallel & (common > 0) & (np.abs(y) > 0.5) & (np.abs(y) < NEXT)
     return one[beside], other[beside], common[beside]
 
 
-def _in_frame(gaps: Gaps, one: Ints, other: Ints) -> tuple[Values, Values]:
-    """Middles of other gaps from those of some: metres along their rows, and spacings to the left."""
+def _in_frame(gaps: Gaps, one: Ints | np.intp, other: Ints) -> tuple[Values, Values]:
+    """Middles of other gaps from one or as many: metres along its row, and spacings to the left."""
     way, along = gaps.middle[other] - gaps.middle[one], gaps.along[one]
-    left = along[..., 0] * way[..., 1] - along[..., 1] * way[..., 0]
-    return (way * along).sum(axis=-1), left / gaps.spacing[one]
+    left = along[..., 0] * way[:, 1] - along[..., 1] * way[:, 0]
+    return (way * along).sum(axis=1), left / gaps.spacing[one]
 
 
 def _leads_out(tree: cKDTree, gaps: Gaps, lane: Ints, track_width: float) -> bool:
     """Whether open ground leads out of the field on both sides of gaps side by side, and through all but a few rows."""
-    first = np.broadcast_to(lane[0], len(lane))
-    x, y = _in_frame(gaps, first, lane)
-    last = lane[[y.argmin(), y.argmax()]]
-    ways = (-1, 1) * np.where(gaps.along[last] @ gaps.along[lane[0]] < 0, -1, 1)
-    stopped, beyond = np.transpose(
-        [_beyond(tree, gaps, k, way, track_width) for k, way in zip(last, ways, strict=True)]
-    )
+    along, spacing = gaps.along[lane[0]], gaps.spacing[lane[0]]
+    x, y = _in_frame(gaps, lane[0], lane)
+    right, left = lane[y.argmin()], lane[y.argmax()]
+    beyond = {k: _beyond(tree, gaps, k, track_width) for k in {right, left}}
+    # Left of the lane may be right of a gap that is told from its other end.
+    sides = [beyond[k][side ^ int(gaps.along[k] @ along < 0)] for k, side in ((right, 1), (left, 0))]
+    stopped, standing = np.transpose(sides)
     within = round(float(np.ptp(y)))
-    rows = beyond.sum() + within
     others = np.setdiff1d(np.arange(within + 1), np.rint(y - y.min())) + y.min()
     order = np.argsort(y)
-    along, spacing = gaps.along[lane[0]], gaps.spacing[lane[0]]
-    aside = others * spacing * np.array([[-along[1]], [along[0]]])
-    places = gaps.middle[lane[0]] + np.interp(others, y[order], x[order])[:, None] * along + aside.T
-    through = np.count_nonzero(tree.query(places)[0] < min(track_width / 2, OPEN * spacing)) if len(others) else 0
+    aside = others[:, None] * spacing * [-along[1], along[0]]
+    places = gaps.middle[lane[0]] + np.interp(others, y[order], x[order])[:, None] * along + aside
+    through = np.count_nonzero(tree.query(places)[0] < _keeps(track_width, spacing)) if len(others) else 0
+    rows = standing.sum() + within
     return bool(rows > 1 and stopped.max() <= EDGE and stopped.sum() + through <= (1 - MOST) * rows)
 
 
-def _beyond(tree: cKDTree, gaps: Gaps, k: int, way: int, track_width: float) -> tuple[int, int]:
-    """Rows on one side of a gap, left (1) or right (-1), that stand where open ground doesn't lead, and all there."""
+def _keeps(track_width: float, spacing: float) -> float:
+    """Metres that open ground keeps from key points."""
+    return min(track_width / 2, OPEN * spacing)
+
+
+def _beyond(tree: cKDTree, gaps: Gaps, k: np.intp, track_width: float) -> list[tuple[int, int]]:
+    """Rows to the left of a gap, and to its right, that stand where open ground doesn't lead, and all there."""
     middle, along, length, spacing = gaps.middle[k], gaps.along[k], float(gaps.length[k]), float(gaps.spacing[k])
     around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
     near = tree.data[tree.query_ball_point(middle, around)] - middle
-    x, y = near @ along, way * (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
-    y = np.sort(y[(np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK) & (y > 0.5) & (y < ACROSS + 0.5)])
-    # The field ends at what is farther away than the next row.
-    rows = np.unique(np.rint(y[: np.append(np.diff(y, prepend=0) > APART, True).argmax()]))
-    if len(rows) == 0:
-        return 0, 0
-    far = _open_across(tree, middle, along, length, spacing, min(track_width / 2, OPEN * spacing))[0 if way > 0 else 1]
-    return int(np.count_nonzero(rows > far)), len(rows)
+    x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
+    y = y[(np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)]
+    far = _open_across(tree, middle, along, length, spacing, _keeps(track_width, spacing))
+    out = []
+    for aside, open_to in zip((y, -y), far, strict=True):
+        there = np.sort(aside[(aside > 0.5) & (aside < ACROSS + 0.5)])
+        # The field ends at what is farther away than the next row.
+        rows = np.unique(np.rint(there[: np.append(np.diff(there, prepend=0) > APART, True).argmax()]))
+        out.append((int(np.count_nonzero(rows > open_to)), len(rows)))
+    return out
 
 
 def _with_posts(gaps: Gaps, lane: Ints, cover: Raster) -> int:
@@ -157,7 +163,7 @@ def _with_posts(gaps: Gaps, lane: Ints, cover: Raster) -> int:
     for k in lane:
         if not len(at := _posts(gaps, k, cover)):
             continue
-        x, y = _in_frame(gaps, np.broadcast_to(k, len(lane)), lane)
+        x, y = _in_frame(gaps, k, lane)
         near = np.abs(y) <= ACROSS
         low, high = _corridor(x[near], y[near] * gaps.spacing[k], gaps.length[lane[near]] / 2)
         sides = at - low, high - at
@@ -196,13 +202,6 @@ def _posts(gaps: Gaps, k: int, cover: Raster) -> Values:
     spots = find_objects(label(on > POST / 2)[0])
     out = [at[spot].mean() for (spot,) in spots if on[spot].max() > max(POST, 2 * beside)]
     return np.array(out)
-
-
-def parts_of(n: int, one: Ints, other: Ints) -> Ints:
-    """Which of what hangs together each of n belongs to, linked in pairs."""
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(n, n))
-    out: Ints = connected_components(graph, directed=False)[1]
-    return out
 
 
 def _open_across(
