@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 NEAR = 0.8
 """Metres within which a gap and a dead vine belong together."""
 LONG = 1.5
-"""Metres from which a gap is one of two vines or more."""
+"""Metres from which a gap is one of missing vines: shorter ones may part bushes that stand apart."""
 
 
 class Errors(NamedTuple):
