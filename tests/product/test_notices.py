@@ -32,6 +32,10 @@ def unmapped(*told):
     return gpd.GeoDataFrame(table, geometry=[box(0, 0, 1, 1)] * len(told), crs=32632)
 
 
+def heights_of(rows, chm, unmapped):
+    return height_notices(rows, chm, unmapped, highest=3.6)
+
+
 def notices_of(rows, chm, parcel, n_points, *places):
     return notices(rows, chm, parcel, unmapped(*places), n_points)
 
@@ -168,25 +172,25 @@ def at(height, **columns):
 
 
 def test_heights_of_vines_need_no_remark():
-    assert height_notices(*at(1.9), unmapped()) == []
-    assert height_notices(*at(3.4, height_m=3.3), unmapped()) == []
+    assert heights_of(*at(1.9), unmapped()) == []
+    assert heights_of(*at(3.4, height_m=3.3), unmapped()) == []
 
 
 def test_rows_whose_heights_are_not_known():
-    (remark,) = height_notices(*at(0.6, height_m=np.nan), unmapped())
+    (remark,) = heights_of(*at(0.6, height_m=np.nan), unmapped())
     assert remark.startswith("1 of 1 rows have no canopy that could be measured")
     assert "are heights in metres?" in remark
 
 
 def test_rows_under_something_higher():
-    (remark,) = height_notices(*at(6.2, height_m=3.5), unmapped())
+    (remark,) = heights_of(*at(6.2, height_m=3.5), unmapped())
     assert remark.startswith("plants are higher than 3.6 m on 100% of the rows")
 
 
 @pytest.mark.parametrize(("area", "told"), [(0.2 * AREA, False), (0.5 * AREA, True)])
 def test_more_that_is_too_tall_than_trees(area, told):
     """As where heights are in decimetres, or a part of the cloud lies above another datum, and a row was found."""
-    remarks = height_notices(*at(1.9), unmapped(("too tall", area, 19.0, 2.0)))
+    remarks = heights_of(*at(1.9), unmapped(("too tall", area, 19.0, 2.0)))
     assert [remark.startswith("what stands on 1,200 m² (50% of the parcel) is up to 19.0 m") for remark in remarks] == [
         True
     ] * told
@@ -196,15 +200,15 @@ def test_more_that_is_too_tall_than_trees(area, told):
 def test_no_row_among_heights_that_no_vineyard_has(height, told):
     seen = chm()
     seen.values[:, ::4] = height
-    (remark,) = height_notices(rows(), seen, unmapped())
+    (remark,) = heights_of(rows(), seen, unmapped())
     assert told in remark
     assert "no row" not in remark  # as :func:`notices` says why
     seen.values[:, ::4] = 1.9
-    assert height_notices(rows(), seen, unmapped()) == []
+    assert heights_of(rows(), seen, unmapped()) == []
 
 
 def test_no_points_have_no_heights():
-    assert height_notices(rows(), chm(box(-1, -1, 61, 41)), unmapped()) == []
+    assert heights_of(rows(), chm(box(-1, -1, 61, 41)), unmapped()) == []
 
 
 def test_what_was_not_seen_of_rows():

@@ -28,7 +28,7 @@ COVERED = 0.95
 DENSE = 60.0
 """Points a square metre below which canopies come out poorly."""
 SURE = 0.5
-"""Confidence of a row that is worth a look."""
+"""Confidence, of a row or of its canopy, below which it is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
 MISTAKEN = 0.4
@@ -154,9 +154,7 @@ def _reasons(unmapped: gpd.GeoDataFrame) -> str:
     return "; ".join(told)
 
 
-def height_notices(
-    rows: gpd.GeoDataFrame, chm: Raster, unmapped: gpd.GeoDataFrame, *, highest: float = 3.6
-) -> list[str]:
+def height_notices(rows: gpd.GeoDataFrame, chm: Raster, unmapped: gpd.GeoDataFrame, *, highest: float) -> list[str]:
     """Remarks on heights that no vineyard has, as where feet were read as metres.
 
     Parameters are as of :func:`notices`, and the height in metres up to which canopies are looked for.
