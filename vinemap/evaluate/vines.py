@@ -8,14 +8,13 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
-from scipy.ndimage import gaussian_filter1d
 
 from vinemap.canopy.numbers import lengths_of
 from vinemap.evaluate.planting import Edges, estimate_extent, estimate_spacing, place_vines
 from vinemap.evaluate.trunks import known_spacing, with_known
 from vinemap.geo.curve import at, tangents
 from vinemap.geo.raster import sample_across
-from vinemap.rows.ends import MISSING, UNSEEN
+from vinemap.rows.ends import MISSING, UNSEEN, thereabouts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -96,14 +95,18 @@ def find_vines(
     stands = [_stands(rows.iloc[own], [unseen[k] for k in own], sections, cover, step) for own in members]
     edges = [[stand.edges for stand in part] for part in stands]
     known = known or {}
-    usual = vine_spacing or known_spacing(known.values()) or estimate_spacing([row for part in edges for row in part])
+    given = [{k: known[one] for k, one in enumerate(own.tolist()) if one in known} for own in members]
+    pairs = zip(given, edges, strict=True)
+    usual = [vine_spacing or known_spacing(own.values()) or estimate_spacing(told) for own, told in pairs]
+    if not all(usual):
+        others = known_spacing(known.values()) or estimate_spacing([row for part in edges for row in part])
+        usual = [one or others for one in usual]
     spacing = rows["vine_spacing_m"].to_numpy(dtype=float, copy=True)
     tables = [pd.DataFrame(columns=["row", "position_m", "position_sd_m", "bare", "block"], dtype=float)]
-    for own, part, told in zip(members, stands, edges, strict=True):
-        given = {k: known[one] for k, one in enumerate(own.tolist()) if one in known}
-        if apart := vine_spacing or known_spacing(given.values()) or estimate_spacing(told) or usual:
+    for own, part, told, theirs, apart in zip(members, stands, edges, given, usual, strict=True):
+        if apart:
             extent = estimate_extent(told, apart)
-            row, position, deviation = with_known(place_vines(told, apart, extent), given)
+            row, position, deviation = with_known(place_vines(told, apart, extent), theirs)
             bare = _bare(part, row, position, CORE * min(extent, apart))
             columns = own[row], position, deviation, bare, np.full(len(row), block[own[0]])
             tables.append(pd.DataFrame(dict(zip(tables[0].columns, columns, strict=True))))
@@ -158,10 +161,7 @@ def _relative(profile: Values) -> Values:
     """Cover (stations,) along a row as a share of what it is thereabouts where there is canopy."""
     present = profile[profile > 0.3 * np.quantile(profile, 0.95)]
     typical = float(np.median(present)) if len(present) else 1.0
-    living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
-    near, weight = (gaussian_filter1d(v, AROUND / CELL, mode="constant") for v in (profile * living, living))
-    out: Values = profile / ((near + 0.1 * typical) / (weight + 0.1))
-    return out
+    return profile / thereabouts(profile, typical, around=AROUND / CELL)
 
 
 def _bare_runs(canopy: Values) -> Ints:

@@ -95,10 +95,7 @@ def find_canopy(
     if len(present) == 0:
         return None
     typical = float(np.median(present))
-    # The last vine may be a weak one: what counts is the cover thereabouts, where there is canopy at all.
-    living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
-    near, weight = (gaussian_filter1d(v, AROUND / CELL, mode="constant") for v in (profile * living, living))
-    profile *= typical / ((near + 0.1 * typical) / (weight + 0.1))
+    profile *= typical / thereabouts(profile, typical, around=AROUND / CELL)
     edge = end_share * typical
     # Thin canopies have holes: what a weaker trace joins is one run, from its first to its last full edge.
     weak = runs_above(profile, 0.5 * edge)
@@ -111,6 +108,17 @@ def find_canopy(
     sides = np.array([_sides(ridge[int(a) : int(b) + 1]) for a, b in np.array(runs)[long]])
     contrast = float(np.clip(1 - _sides(ridge[profile > edge]), 0, 1))
     return Standing(curve, metres[long], contrast, sides=sides)
+
+
+def thereabouts(profile: Values, typical: float, *, around: float) -> Values:
+    """Cover (stations,) along a row thereabouts, where there is canopy at all: its last vine may be a weak one.
+
+    Told are the cover that is typical of the row, and a standard deviation in stations.
+    """
+    living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
+    near, weight = (gaussian_filter1d(v, around, mode="constant") for v in (profile * living, living))
+    out: Values = (near + 0.1 * typical) / (weight + 0.1)
+    return out
 
 
 def _sides(image: Values) -> float:
