@@ -49,11 +49,6 @@ class Shift(NamedTuple):
     """Their ends that do."""
 
     @property
-    def length(self) -> float:
-        """Metres."""
-        return float(np.hypot(*self.metres))
-
-    @property
     def covariance(self) -> Values:
         """(2, 2), m², to the east and north; infinite where it isn't told."""
         with np.errstate(invalid="ignore"):

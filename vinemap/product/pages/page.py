@@ -142,13 +142,13 @@ def mean_of(values: ArrayLike, weights: ArrayLike) -> float:
     return float(np.average(values[known], weights=weights[known])) if known.any() else np.nan
 
 
-def whole_numbers(values: ArrayLike, *, unit: float) -> list[int | None]:
-    """Values (n,) in whole units, 0.01 for centimetres; None for what isn't finite."""
+def whole_numbers(values: ArrayLike, *, unit: float) -> list[Any]:
+    """Values, of any shape, in whole units, 0.01 for centimetres; None for what isn't finite."""
     counts = np.asarray(values, dtype=float) / unit
     known = np.isfinite(counts)
-    out: list[int | None] = np.rint(np.where(known, counts, 0.0)).astype(np.int64).tolist()
-    for unknown in np.flatnonzero(~known).tolist():
-        out[unknown] = None
+    whole = np.full(counts.shape, None, dtype=object)
+    whole[known] = np.rint(counts[known]).astype(np.int64)
+    out: list[Any] = whole.tolist()
     return out
 
 

@@ -64,5 +64,5 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
         "units": UNITS,
         "labels": labels.tolist(),
         "doubtful": doubtful.tolist(),
-        **{name: [whole_numbers(row, unit=UNITS[name]) for row in column] for name, column in values.items()},
+        **{name: whole_numbers(column, unit=UNITS[name]) for name, column in values.items()},
     }
