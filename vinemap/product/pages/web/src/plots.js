@@ -61,7 +61,7 @@ export function showPlots(rows, profiles, step, mark) {
         cursor: { sync: { key: "row" }, y: false, drag: { x: false, y: false }, points: { size: 7, fill: colour("selected"), stroke: colour("paper") } },
         scales: { x: { time: false, range: [0, row.line.length] }, y: { range: [0, tops[name]] } },
         axes: [
-          { show: true, size: last ? 36 : 6, values: last ? (_, ticks) => ticks.map((tick) => number(tick)) : () => [], stroke: colour("soft"), grid, ticks: { show: last, stroke: colour("grid") }, font: "12px system-ui, sans-serif", label: last ? "metres from the western end" : undefined, labelSize: 16, labelGap: 0, labelFont: "12px system-ui, sans-serif" },
+          { show: true, size: last ? 36 : 6, values: last ? (_, ticks) => ticks.map((tick) => number(tick)) : () => [], stroke: colour("soft"), grid, ticks: { show: last, stroke: colour("grid") }, font: "12px system-ui, sans-serif", label: last ? "metres from e1" : undefined, labelSize: 16, labelGap: 0, labelFont: "12px system-ui, sans-serif" },
           { size: 40, space: 26, stroke: colour("soft"), grid, ticks: { show: false }, font: "12px system-ui, sans-serif", values: (_, ticks) => ticks.map((tick) => number(tick, Number.isInteger(tick) ? 0 : tick * 4 === Math.round(tick * 4) && tick * 2 !== Math.round(tick * 2) ? 2 : 1)) },
         ],
         series: [{}, { stroke: colour("line"), width: 1.6, fill: colour("area"), points: { show: false }, spanGaps: false }],

@@ -1,6 +1,6 @@
 // The page of a parcel.
 import { data, unpack, unpackJSON } from "./data.js";
-import { at, choice, element, number } from "./page.js";
+import { at, choice, element, number, plural } from "./page.js";
 import { showHead, showQuality, showRecord, showUnmapped } from "./words.js";
 import { showDates } from "./dates.js";
 import { measured } from "./line.js";
@@ -53,7 +53,8 @@ async function start() {
     at("row").value = String(rows.indexOf(row));
     at("facts").textContent = [
       `${number(row.length_m, 1)} m long`, `${number(row.volume_m, 2)} m³ of canopy a metre`,
-      row.gaps.length ? `${row.gaps.length} gap${row.gaps.length > 1 ? "s" : ""} of ${number(row.gap_m, 1)} m, ${number(row.n_missing)} vine${row.n_missing === 1 ? "" : "s"} missing` : "no gap",
+      row.gaps.length ? `${plural(row.gaps.length, "gap")} of ${number(row.gap_m, 1)} m` : "no gap",
+      row.gaps.length || row.n_missing ? `${plural(row.n_missing, "vine")} missing` : "",
       row.unseen_m ? `${number(row.unseen_m, 1)} m not seen` : "",
       row.flags ? `odd: ${row.flags}` : "",
     ].filter(Boolean).join(" · ");

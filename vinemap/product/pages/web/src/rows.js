@@ -16,8 +16,8 @@ const COLUMNS = [
   ["volume_m", "Volume a metre", "m³/m", 3, "Volume over length, gaps included, but for what was not seen"],
   ["trv_m3_ha", "TRV", "m³/ha", 0, "Tree-row volume"],
   ["lwa_m2_ha", "LWA", "m²/ha", 0, "Leaf-wall area"],
-  ["gap_m", "Gaps", "m", 2, "Length without vines"],
-  ["n_missing", "Missing", "vines", 0, "Vines missing in the gaps"],
+  ["gap_m", "Gaps", "m", 2, "Length without canopy, as far as it was seen"],
+  ["n_missing", "Missing", "vines", 0, "Vines missing in it, as far as it was seen"],
   ["unseen_m", "Not seen", "m", 2, "Length of which the points show nothing, neither vines nor gaps"],
   ["support", "Support", "", 2, "Share of the length that was seen with canopy"],
   ["confidence", "Confidence", "", 2, "That it is a whole row, no more and no less: 0 to 1"],
@@ -36,10 +36,10 @@ export function rowTable(rows, selected) {
     text: digits === null,
     show: digits === null ? (value) => value || "" : (value) => number(value, digits),
   }));
-  const label = { title: "Row", help: "Number of the row, e1 is its western end", values: rows.map((row) => row.row_id), text: true, show: (_, k) => rows[k].label };
+  const label = { title: "Row", help: "Number of the row", values: rows.map((row) => row.row_id), text: true, show: (_, k) => rows[k].label };
   const made = table([label, ...columns], { caption: "Rows in numbers", onselect: (k) => selected.set(rows[k]), sorted: 0 });
   made.element.classList.add("tall");
-  at("table").append(made.element, element("p", { class: "hint" }, "A click on a heading sorts, on a row selects it. e1 is the western end of a row, en the eastern; x, y, z are metres to the east, north and up of the origin of {Main}, lat, lon, alt are WGS 84."));
+  at("table").append(made.element, element("p", { class: "hint" }, "A click on a heading sorts, on a row selects it. e1 is the western end of a row, or a known row’s first, en the other; x, y, z are metres to the east, north and up of the origin of {Main}, lat, lon, alt are WGS 84."));
   return {
     select(row) {
       made.lines.forEach((line, k) => {
