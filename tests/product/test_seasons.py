@@ -175,3 +175,5 @@ def test_what_was_not_seen_of_a_row_is_told_beside_its_numbers(estate):
     told = history([(products[survey], read_rows(products[survey].folder, "A")) for survey in ("fall", "june")])
     length, seen = (np.array(told[name], dtype=float) * told["units"][name] for name in ("length_m", "seen_m"))
     assert length - seen == pytest.approx(np.array([[0, 0], [0, 0], [0, 0], [12.5, np.nan]]), abs=0.11, nan_ok=True)
+    whole = changes.tell_parcel(products["june"], [], "EPSG:32632")["told"]
+    assert whole["length_m"] - whole["seen_m"] == pytest.approx(12.5)

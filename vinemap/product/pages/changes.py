@@ -12,7 +12,7 @@ from vinemap.evaluate.changes import GONE, compare_rows, summarise
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.pages.page import mean_of, polylines
 from vinemap.product.seasons.history import history
-from vinemap.product.seasons.products import read_rows, shift_between
+from vinemap.product.seasons.products import read_rows, seen_lengths, shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -81,6 +81,7 @@ def _numbers(rows: gpd.GeoDataFrame | None) -> dict[str, Any]:
         return {}
     length = rows["length_m"].to_numpy(dtype=float)
     told: dict[str, Any] = {name: float(rows[name].sum()) for name in ("length_m", "volume_m3", "gap_m", "n_missing")}
+    told["seen_m"] = float(seen_lengths(rows).sum())
     return told | {"rows": len(rows), "height_m": mean_of(rows["height_m"], length)}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from vinemap.evaluate.changes import follow_rows
 from vinemap.product.notices import SURE
 from vinemap.product.pages.page import whole_numbers
-from vinemap.product.seasons.products import shift_between
+from vinemap.product.seasons.products import seen_lengths, shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,8 +53,7 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
         labels[found, date] = table["label"]
         if "canopy_confidence" in table:
             doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < SURE
-        unseen = table["unseen_m"].fillna(0.0) if "unseen_m" in table else 0.0
-        shown = table.assign(seen_m=table["length_m"] - unseen)
+        shown = table.assign(seen_m=seen_lengths(table))
         for name, column in values.items():
             column[found, date] = shown[name]
     return {

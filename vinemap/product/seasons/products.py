@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
+    import pandas as pd
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
 """What is read of rows, beside what wasn't seen of them."""
@@ -194,6 +195,13 @@ def _surveys_beside(folder: Path, latest: datetime) -> Iterator[Path]:
 def _shared(one: shapely.Geometry, other: shapely.Geometry) -> float:
     smaller = min(shapely.area(one), shapely.area(other))
     return float(shapely.area(shapely.intersection(one, other)) / smaller) if smaller > 0 else 0.0
+
+
+def seen_lengths(rows: gpd.GeoDataFrame) -> pd.Series:
+    """Metres of each row that were seen: all where nothing is said of it."""
+    unseen = rows["unseen_m"].fillna(0.0) if "unseen_m" in rows else 0.0
+    seen: pd.Series = rows["length_m"] - unseen
+    return seen
 
 
 def read_rows(folder: Path, parcel: str) -> gpd.GeoDataFrame | None:

@@ -78,7 +78,7 @@ function head() {
   const days = [...new Set(flown.map(day))];
   at("over").textContent = ["Survey", days.length && `flown ${days.join(" to ")}`].filter(Boolean).join(" · ");
   at("title").textContent = survey;
-  const length = sum("length_m");
+  const [length, seen] = ["length_m", "seen_m"].map(sum);
   const ha = sum("area_m2") / 1e4;
   facts(at("figures"), [
     ["Parcels", number(mapped.length), mapped.length < parcels.length ? `of ${number(parcels.length)}` : ""],
@@ -87,7 +87,7 @@ function head() {
     ["Area", number(ha, 2), "ha"],
     ["Canopy volume", number(sum("volume_m3")), "m³", ha ? `${number(sum("volume_m3") / ha)} m³/ha` : ""],
     ["Missing vines", number(sum("n_missing"))],
-    ["Gaps", number(sum("gap_m")), "m", length ? `${number((100 * sum("gap_m")) / length, 1)}% of the length` : ""],
+    ["Gaps", number(sum("gap_m")), "m", seen ? `${number((100 * sum("gap_m")) / seen, 1)}% of the length` : ""],
   ]);
   const failed = parcels.filter((parcel) => parcel.state === "failed");
   const warned = parcels.filter((parcel) => parcel.warnings?.length);

@@ -7,9 +7,9 @@ import { MEASURES, growthOf, isDoubtful, valueOf } from "./seasons.js";
 
 const QUANTITIES = {
   rows: { title: "Rows alone" },
-  density: { title: "Volume per metre", unit: "m³/m", digits: 2, of: ({ volume_m3: v, length_m: l }) => (l ? v / l : null) },
+  density: { title: "Volume per metre", unit: "m³/m", digits: 2, of: ({ volume_m3: v, seen_m: l }) => (l ? v / l : null) },
   height: { title: "Height", unit: "m", digits: 2, of: (parcel) => parcel.height_m },
-  gaps: { title: "Gaps, share of the rows", unit: "%", digits: 1, of: ({ gap_m: g, length_m: l }) => (l ? (100 * g) / l : null), turned: true, zero: true },
+  gaps: { title: "Gaps, share of the rows", unit: "%", digits: 1, of: ({ gap_m: g, seen_m: l }) => (l ? (100 * g) / l : null), turned: true, zero: true },
   volume: { title: "Change of volume", unit: "%", digits: 1, of: ({ summary }) => (summary?.d_volume === undefined || summary.d_volume === null ? null : 100 * summary.d_volume), diverging: true, least: 2 },
   tall: { title: "Change of height", unit: "m", digits: 2, of: ({ summary }) => summary?.d_height_m, diverging: true, least: 0.05 },
   missing: { title: "Change of missing vines", unit: "vines", digits: 0, of: ({ summary }) => summary?.d_n_missing, diverging: true, least: 2, turned: true },
