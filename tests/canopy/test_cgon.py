@@ -1,4 +1,4 @@
-"""Peeling against its definition, c-gons against brute force and against the bilinear programme, odd sections."""
+"""C-gons against brute force and against the bilinear programme, and those of odd sections."""
 
 from itertools import combinations, pairwise
 
@@ -6,36 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from polygons import canopy, cross, one, shoelace
 from scipy.optimize import minimize, minimize_scalar
 from shapely import MultiPoint, Point, Polygon
 
 from vinemap.canopy.cgon import enclose
 from vinemap.canopy.growth import grow
 from vinemap.canopy.hull import hull
-from vinemap.canopy.peeling import peel, peel_sections
-
-
-def cross(a, b, p):
-    return (b[..., 0] - a[..., 0]) * (p[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (p[..., 0] - a[..., 0])
-
-
-def shoelace(polygon):
-    y, z = (polygon - polygon[0]).T
-    return (y * np.roll(z, -1) - np.roll(y, -1) * z).sum() / 2
-
-
-def one(points, feet, **kwargs):
-    return enclose(points, [0, len(points)], np.asarray(feet)[None], **kwargs)
-
-
-def canopy(rng, n):
-    """Points of a section of canopy, top-heavy, round or ragged, on one foot or two."""
-    z = rng.beta(*rng.uniform(1, 4, 2), n)
-    y = rng.normal(0, 0.1 + 0.2 * z ** rng.uniform(0, 2), n) + rng.normal(0, 0.05)
-    points = np.column_stack([y, 0.5 + rng.uniform(0.5, 1.5) * z])
-    low = points[:, 1].min() - rng.uniform(0.01, 0.1)
-    half = rng.choice([0.02, 0.15, 0.5])
-    return points, np.array([[0, low + rng.uniform(-0.3, 0.1)], [half, low], [-half, low]])
 
 
 def outline(points, feet):
@@ -44,76 +21,6 @@ def outline(points, feet):
     ring = hull(both)
     ring = np.roll(ring, -int(np.flatnonzero(ring == 0)[0]))
     return both[ring[: int(np.flatnonzero(ring == 1)[0]) + 1]]
-
-
-# Hull and peeling
-
-
-def naive_hull(points, alive):
-    """Indices of the hull of some points, in exact arithmetic where the coordinates are small whole numbers."""
-    order = []
-    for i in sorted(alive, key=lambda i: (*points[i], i)):
-        if not order or tuple(points[i]) != tuple(points[order[-1]]):
-            order.append(i)
-    ring = []
-    for part in (order, order[::-1]):
-        chain = []
-        for i in part:
-            while len(chain) > 1 and cross(points[chain[-2]], points[chain[-1]], points[i]) <= 0:
-                chain.pop()
-            chain.append(i)
-        ring += chain[:-1]
-    return ring
-
-
-def naive_peel(points, count):
-    """Algorithm 1 as it is written: whole hulls, once for every vertex of every hull."""
-    alive = list(range(len(points)))
-    removed = []
-    while len(removed) < count and len(alive) > 3:
-        ring = naive_hull(points, alive)
-        if len(ring) < 3:
-            break
-        areas = {}
-        for i in sorted(ring):
-            rest = naive_hull(points, [j for j in alive if j != i])
-            areas[i] = shoelace(points[rest]) if len(rest) > 2 else 0.0
-        removed.append(min(areas, key=areas.get))
-        alive.remove(removed[-1])
-    return removed
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_peeling_removes_in_the_order_of_its_definition(seed):
-    rng = np.random.default_rng(seed)
-    points = (rng.normal(size=(60, 2)), rng.random((60, 2)), canopy(rng, 60)[0])[seed % 3]
-    assert peel(points, 25).tolist() == naive_peel(points, 25)
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=18))
-def test_peeling_of_ties_duplicates_and_lines_follows_the_definition(cells):
-    points = np.array(cells, dtype=float)
-    assert peel(points, 12).tolist() == naive_peel(points, 12)
-
-
-def test_peeling_stops_at_three_points():
-    assert len(peel(np.random.default_rng(0).random((20, 2)), 99)) == 17
-    assert len(peel(np.zeros((0, 2)), 1)) == len(hull(np.zeros((0, 2)))) == 0
-
-
-def test_count_of_outliers_is_the_share_rounded_up():
-    points = np.random.default_rng(0).random((100, 2))
-    for share, kept in ((0, 100), (0.02, 98), (0.021, 97), (0.07, 93), (0.999, 3)):
-        assert one(points, [[0.5, -1], [1, -1], [0, -1]], share=share).kept.sum() == kept
-
-
-def test_hull_is_counter_clockwise_and_strict():
-    square = [[0, 0], [2, 2], [1, 1], [2, 0], [0, 2], [1, 0], [0, 0]]
-    assert hull(square).tolist() == [0, 3, 1, 4]
-
-
-# The c-gon
 
 
 def meet(p, d, q, e):
@@ -346,53 +253,6 @@ def test_a_million_points():
     points = np.random.default_rng(0).random((1_000_000, 2))
     result = check(points, np.array([[0.5, -0.1], [1, -0.1], [0, -0.1]]), 7, 0.0001)
     assert result.area[0] == pytest.approx(1.1, abs=0.01)
-
-
-# Foliage's outlines
-
-
-def test_peeling_all_sections_is_peeling_each():
-    rng = np.random.default_rng(1)
-    sections = [canopy(rng, n)[0] if n else np.empty((0, 2)) for n in (2, 3, 40, 0, 150)]
-    sections[2][5] = np.nan
-    start = np.concatenate([[0], np.cumsum([len(p) for p in sections])])
-    peeled = peel_sections(np.concatenate(sections), start, share=0.05)
-    for k, points in enumerate(sections):
-        kept = peeled.kept[start[k] : start[k + 1]]
-        finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-        if len(finite) < 3:
-            assert np.isnan(peeled.area[k])
-            assert np.diff(peeled.start)[k] == 0
-            continue
-        gone = finite[peel(points[finite], int(np.ceil(0.05 * len(finite))))]
-        assert set(np.flatnonzero(~kept)) == set(gone) | set(np.flatnonzero(~np.isfinite(points).all(axis=1)))
-        shape = MultiPoint(points[kept]).convex_hull
-        assert peeled.area[k] == pytest.approx(shape.area)
-        assert peeled.perimeter[k] == pytest.approx(shape.length)
-        assert np.diff(peeled.start)[k] == len(shape.exterior.coords) - 1
-        assert Polygon(peeled.hull[peeled.start[k] : peeled.start[k + 1]]).equals(shape)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_foliage_grows_by_its_reach_on_all_sides(seed):
-    points, feet = canopy(np.random.default_rng(seed), 60)
-    outline, start, moved = grow(points, [0, len(points)], feet[None], [0.05])
-    body = MultiPoint(np.vstack([points, feet[1:]])).convex_hull
-    grown = MultiPoint(outline).convex_hull
-    assert start.tolist() == [0, len(outline)]
-    assert grown.covers(body)
-    # Sides move by the reach, blunt corners by a sixth more at the most.
-    assert body.buffer(0.05 / np.cos(np.radians(30)), quad_segs=64).buffer(1e-4).covers(grown)
-    assert grown.exterior.distance(body) > 0.02
-    assert grown.area == pytest.approx(body.buffer(0.05).area, rel=0.03)
-    np.testing.assert_allclose(moved[0] - feet, [[0, -0.05], [0.025, -0.05], [-0.025, -0.05]], atol=1e-12)
-
-
-def test_no_reach_no_growth():
-    points, feet = canopy(np.random.default_rng(0), 60)
-    outline, _, moved = grow(points, [0, len(points)], feet[None], [0.0])
-    assert MultiPoint(outline).convex_hull.equals(MultiPoint(np.vstack([points, feet[1:]])).convex_hull)
-    assert (moved[0] == feet).all()
 
 
 @pytest.mark.parametrize("seed", range(8))
