@@ -4,23 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from vinemap.config.names import check_name, check_parcel
 from vinemap.config.settings import Settings
 from vinemap.config.surveys import choose_parcel, load_estate, load_settings, load_survey
 from vinemap.errors import ConfigError
-from vinemap.paths import safe
 
 SURVEY = "survey: barolo\nparcels: [F, curved, blocks]\n"
-
-
-@pytest.fixture
-def write(tmp_path):
-    def write(text):
-        path = tmp_path / "survey.yaml"
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
 
 
 def test_survey_with_settings(write):
@@ -80,44 +68,6 @@ def test_unknown_parcel_suggests_the_nearest(write):
         choose_parcel(config, "zzz")
 
 
-@pytest.mark.parametrize(
-    "name", ["../F", "a/b", "a\\b", "", ".hidden", "a" * 80, "con:", "x\n", "end.", "Go!", "a%20b"]
-)
-def test_names_with_characters_of_paths(name):
-    with pytest.raises(ConfigError, match="can't name a file"):
-        check_name(name)
-
-
-@pytest.mark.parametrize("name", ["F", "parcel 12", "Cà_Mia-3", "7.b", "60% #2"])
-def test_good_names(name):
-    assert check_name(name) == check_parcel(name) == safe(name) == name
-
-
-@pytest.mark.parametrize(
-    ("name", "folder"),
-    [
-        ("123/4", "123-4"),
-        ("CON", "_CON"),
-        ("com¹", "_com¹"),
-        ("Nul .gpkg", "_Nul .gpkg"),
-        ("CONIN$", "_CONIN$"),
-        (".hidden", "hidden"),
-        ("a%20b", "a-20b"),
-        ("Go!", "Go-"),
-        ("x" * 80, "x" * 64),
-    ],
-)
-def test_names_of_parcels_that_cannot_name_folders(name, folder):
-    assert check_parcel(name) == name
-    assert safe(name) == folder == safe(folder)
-
-
-@pytest.mark.parametrize("name", ["", " ", "..", "../F", "a/../b", "a\\..", "...", "a\x07"])
-def test_what_names_no_parcel(name):
-    with pytest.raises(ConfigError, match="can't name a file, nor a parcel"):
-        check_parcel(name)
-
-
 def test_defaults_of_settings_are_those_of_the_stages():
     """A stage called without options works as one called with the default settings."""
     import inspect
@@ -154,105 +104,6 @@ def test_defaults_of_settings_are_those_of_the_stages():
             defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
             options.pop("align", None)  # the chain's own
             assert defaults == options | {k: others[k] for k in defaults if k not in options}
-
-
-ODD = {
-    "python": "a: !!python/object/apply:os.system [ls]",
-    "tag": "a: !vine 5",
-    "date": "a: !!timestamp may",
-    "bool": "a: !!bool maybe",
-    "int": "a: !!int maybe",
-    "binary number": "a: 0b_",
-    "digits": "a: " + "9" * 5000,
-    "list as a key": "? [1]\n: 2",
-    "tab": "\t- a",
-    "two": "a: 1\n---\na: 2",
-    "twice": "a: 1\na: 2",
-    "twice below": "a: {b: 1, c: 2, b: 3}",
-    "deep list": "[" * 800,
-    "deep keys": "{a: " * 1000,
-    "nul": "a: \0",
-    "not there": "a: *b",
-}
-
-
-@pytest.mark.parametrize("what", ODD)
-def test_odd_yaml(write, what):
-    for load in (load_survey, load_estate, load_settings):
-        with pytest.raises(ConfigError, match=r"survey\.yaml: no valid YAML") as error:
-            load(write(ODD[what]))
-        assert "\n" not in str(error.value)
-
-
-def test_other_encodings(tmp_path):
-    path = tmp_path / "survey.yaml"
-    path.write_bytes("\ufeffsurvey: Cà\r\nparcels: [é]\r\n".encode())
-    assert load_survey(path).parcels == ["é"]
-    for encoding in ("utf-16", "latin-1"):
-        path.write_text("survey: Cà\n", encoding=encoding)
-        with pytest.raises(ConfigError, match="no valid YAML"):
-            load_survey(path)
-
-
-@pytest.mark.parametrize("key", ["a", "survey", "parcels", "origin", "overrides", "settings", "job"])
-def test_laughs_are_few(write, key):
-    """Lists of nine times the same, ten deep: 3.5 milliards of words if somebody wrote them out."""
-    lists = "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 10))
-    with pytest.raises(ConfigError) as error:
-        load_survey(write(f"a0: &a0 [ha, ha]\n{lists}{key}: *a9\n"))
-    assert len(str(error.value)) < 5000
-
-
-@pytest.mark.parametrize("text", ["&a [*a]", "survey: &a [*a]", "&a {survey: x, settings: *a, overrides: {A: *a}}"])
-def test_what_holds_itself(write, text):
-    with pytest.raises(ConfigError):
-        load_survey(write(text))
-
-
-@pytest.mark.parametrize("load", [load_survey, load_estate, load_settings])
-def test_files_that_cannot_be_read(tmp_path, load, monkeypatch):
-    with pytest.raises(ConfigError, match="no such file"):
-        load(tmp_path)
-    with pytest.raises(ConfigError, match="can't be read"):
-        load(tmp_path / ("x" * 300))
-    (tmp_path / "a.yaml").touch()
-    monkeypatch.setattr(Path, "read_text", lambda *words, **options: (_ for _ in ()).throw(PermissionError(13, "no")))
-    with pytest.raises(ConfigError, match=r"a\.yaml: can't be read \(no\)"):
-        load(tmp_path / "a.yaml")
-
-
-def test_names_that_yaml_takes_for_something_else(write):
-    config = load_survey(write("survey: 2026-06-01\nparcels: ['no', '1', 2026-06-01, 7.b, 1e, 'null']\n"))
-    assert config.survey == "2026-06-01"
-    assert config.parcels == ["no", "1", "2026-06-01", "7.b", "1e", "null"]
-    for word in ("no", "1", "1.5", "012", "off", "1_000", "1:30"):
-        with pytest.raises(ConfigError, match=r"parcels\.1 = .*: put it in quotes$"):
-            load_survey(write(f"survey: x\nparcels: [A, {word}]\n"))
-        with pytest.raises(ConfigError, match="put it in quotes"):
-            load_survey(write(f"survey: x\noverrides: {{{word}: {{}}}}\n"))
-
-
-SURROGATE = '"\\ud800"'
-NO_NAMES = ("..", "' '", "''", SURROGATE)
-"""What names neither a survey nor a parcel, whose folder may have another name."""
-
-
-@pytest.mark.parametrize("name", ["..", "/etc", "'C:'", "CON", "nul.txt", "a/b", "' '", "-a", "''", "a*", SURROGATE])
-def test_names_of_surveys_parcels_and_overrides(write, name):
-    texts = [f"survey: {name}\n", f"survey: x\nparcels: [A, {name}]\n", f"survey: x\noverrides: {{{name}: {{}}}}\n"]
-    for text in texts if name in NO_NAMES else texts[:1]:
-        with pytest.raises(ConfigError, match="can't name a file") as error:
-            load_survey(write(text))
-        assert str(error.value).encode()
-    for text in () if name in NO_NAMES else texts[1:]:
-        assert load_survey(write(text))
-
-
-def test_names_are_composed(write):
-    config = load_survey(write("survey: Ca\u0300\nparcels: [e\u0301]\noverrides: {é: {origin: [44, 7, 100]}}\n"))
-    assert (config.survey, config.parcels) == ("Cà", ["é"])
-    assert config.of_parcel("é").origin.alt == 100
-    assert choose_parcel(config, "e\u0301") == "é"
 
 
 @pytest.mark.parametrize(
