@@ -1,44 +1,20 @@
 """A product is made anew if what it is made of has changed, and only then."""
 
-import errno
-import json
 import os
 from datetime import UTC, datetime
-from pathlib import Path
 
 import geopandas as gpd
-import laspy
 import numpy as np
 import pytest
 import shapely
-from systems import POSIX
+from ingredients import PLACE, write_las, write_polygons
 
 from vinemap.config.settings import Settings
-from vinemap.errors import BusyError, InputError
+from vinemap.errors import InputError
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.main import Origin
 from vinemap.product import recipe
-from vinemap.product.recipe import Source, flown, product_in, read_source, recipe_of, vines_of
-
-PLACE = np.array([414_700.0, 4_940_700.0])
-
-
-def write_las(path, *, seed=0, date=datetime(2024, 6, 1, tzinfo=UTC)):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales = np.full(3, 0.001)
-    header.offsets = [*PLACE, 0]
-    header.creation_date = date
-    header.add_crs(parse_crs("EPSG:32632"))
-    las = laspy.LasData(header)
-    las.xyz = np.random.default_rng(seed).uniform([*PLACE, 0], [*(PLACE + 20), 2], (50, 3))
-    las.write(path)
-    return path
-
-
-def write_polygons(path, names, *, crs=32632, grow=0.0):
-    squares = [shapely.box(*(PLACE + 20 * k), *(PLACE + 20 * k + 15)).buffer(grow) for k in range(len(names))]
-    gpd.GeoDataFrame({"name": names}, geometry=squares, crs=32632).to_crs(crs).to_file(path)
-    return path
+from vinemap.product.recipe import recipe_of, vines_of
 
 
 @pytest.fixture
@@ -170,219 +146,6 @@ def test_the_key_tells_nothing_else(made, cloud, boundaries, tmp_path):
     drawn[::-1].to_file(tmp_path / "turned.geojson")
     assert recipe_of(moved, parcel="A", boundary=tmp_path / "turned.geojson").key == made.key
     assert made._replace(settings=Settings.model_validate(Settings().model_dump())).key == made.key
-
-
-def test_the_date_is_the_headers_or_else_the_files(tmp_path):
-    cloud = write_las(tmp_path / "a.las", date=datetime(2023, 2, 1, tzinfo=UTC))
-    assert flown(read_source(cloud)) == datetime(2023, 2, 1, tzinfo=UTC)
-    with cloud.open("r+b") as stream:
-        stream.seek(90)
-        stream.write(bytes(4))
-    os.utime(cloud, (1_700_000_000.9, 1_700_000_000.9))
-    assert flown(read_source(cloud)) == datetime.fromtimestamp(1_700_000_000, UTC)
-    source = read_source(cloud)
-    cloud.unlink()
-    with pytest.raises(InputError, match=r"a\.las: no such file"):
-        flown(source)
-
-
-@pytest.fixture
-def hashed(monkeypatch):
-    """Names of the files whose content is read."""
-    read, digest = [], recipe.hashlib.file_digest
-
-    def file_digest(stream, kind):
-        read.append(Path(stream.name).name)
-        return digest(stream, kind)
-
-    monkeypatch.setattr(recipe.hashlib, "file_digest", file_digest)
-    return read
-
-
-def long_ago(path, seconds=100.0):
-    """What is known of a file that was read so many seconds after its last change."""
-    stat = path.stat()
-    return read_source(path)._replace(read=max(stat.st_mtime, stat.st_ctime) + seconds)
-
-
-def test_a_file_that_is_known_is_not_read_again(cloud, hashed):
-    known = long_ago(cloud)
-    assert read_source(cloud, [known._replace(path=Path("other.las")), known]) is known
-    assert hashed == ["may.las"]
-
-
-def test_what_is_known_goes_through_json(cloud, hashed):
-    """As a survey's record keeps it."""
-    known = long_ago(cloud)
-    stored = json.loads(json.dumps({**known._asdict(), "path": str(cloud)}))
-    again = Source(Path(stored["path"]), stored["sha256"], tuple(stored["stamp"]), stored["read"])
-    assert read_source(cloud, [again]) is again
-    assert hashed == ["may.las"]
-
-
-def test_a_file_read_within_the_clocks_granularity_of_its_change_is_read_again(cloud, hashed):
-    """It may have changed once more without its time telling."""
-    for seconds in (-1, 0, 1, recipe.SETTLED - 0.1):
-        read_source(cloud, [long_ago(cloud, seconds)])
-    assert len(hashed) == 8
-    read_source(cloud, [long_ago(cloud, recipe.SETTLED + 0.1)])
-    assert len(hashed) == 9
-
-
-@POSIX
-def test_a_file_of_the_future_is_read_again(cloud, hashed):
-    """Written by a machine whose clock is ahead."""
-    os.utime(cloud, (4e9, 4e9))
-    known = read_source(cloud)
-    assert read_source(cloud, [known]).sha256 == known.sha256
-    assert len(hashed) == 2
-
-
-@POSIX
-def test_another_file_of_the_same_size_and_time_is_read(cloud, tmp_path, hashed):
-    known = long_ago(cloud)
-    stat = cloud.stat()
-    other = write_las(tmp_path / "other.las", seed=1)
-    os.utime(other, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    other.replace(cloud)
-    assert (cloud.stat().st_size, cloud.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
-    assert read_source(cloud, [known]).sha256 != known.sha256
-
-
-@POSIX
-def test_a_file_changed_in_place_whose_time_was_set_back_is_read(cloud, hashed):
-    known = long_ago(cloud)
-    stat = cloud.stat()
-    with cloud.open("r+b") as stream:
-        stream.seek(-1, os.SEEK_END)
-        stream.write(b"\x7f")
-    os.utime(cloud, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-    assert cloud.stat().st_mtime_ns == stat.st_mtime_ns
-    assert read_source(cloud, [known]).sha256 != known.sha256
-
-
-@pytest.mark.parametrize("how", ["grows", "is replaced", "is gone"])
-def test_a_file_that_changes_while_it_is_read(cloud, tmp_path, monkeypatch, how):
-    other, digest = write_las(tmp_path / "other.las", seed=1), recipe.hashlib.file_digest
-
-    def file_digest(stream, kind):
-        found = digest(stream, kind)
-        if how == "grows":
-            with cloud.open("ab") as more:
-                more.write(b"more")
-        elif how == "is replaced":
-            other.replace(cloud)
-        else:
-            cloud.unlink()
-        return found
-
-    monkeypatch.setattr(recipe.hashlib, "file_digest", file_digest)
-    with pytest.raises(BusyError, match=r"may\.las: changed while it was read: try again") as error:
-        read_source(cloud)
-    assert error.value.heals
-
-
-def test_a_source_can_be_checked_later(made, cloud):
-    made.sources[0].check()
-    with cloud.open("ab") as stream:
-        stream.write(b"more")
-    with pytest.raises(BusyError):
-        made.sources[0].check()
-
-
-@pytest.mark.parametrize(
-    ("number", "kind"), [(errno.EIO, BusyError), (errno.ESTALE, BusyError), (errno.EACCES, InputError)]
-)
-def test_a_disk_that_fails(cloud, monkeypatch, number, kind):
-    """What may pass is told from what won't."""
-    for name in ("open", "stat"):
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, name, lambda *words, **options: (_ for _ in ()).throw(OSError(number, "broken")))
-            with pytest.raises(kind, match=r"may\.las: can't be read \(broken\)"):
-                read_source(cloud)
-
-
-def test_what_is_no_file(tmp_path):
-    with pytest.raises(InputError, match="none: no such file"):
-        read_source(tmp_path / "none")
-    with pytest.raises(InputError, match="can't be read"):
-        read_source(tmp_path)
-    with pytest.raises(InputError, match="can't be read"):
-        read_source(tmp_path / ("x" * 300))
-
-
-@POSIX
-def test_a_name_that_is_no_unicode_can_be_told(tmp_path):
-    """As of a file that was copied from an old disk."""
-    path = tmp_path / os.fsdecode(b"Nebbiolo \xe0.las")
-    write_las(tmp_path / "a.las").rename(path)
-    with pytest.raises(InputError, match="rename it") as error:
-        read_source(path)
-    assert str(error.value).encode()
-
-
-RECORD = {
-    "key": "k",
-    "parcel": "A",
-    "counts": {"rows": 3},
-    "length_m": 12.5,
-    "warnings": ["few points"],
-    "files": {"A.gpkg": 4, "A_dtm.tif": 0},
-}
-
-
-def write_product(folder, record):
-    folder.mkdir()
-    (folder / "A.gpkg").write_bytes(b"1234")
-    (folder / "A_dtm.tif").touch()
-    (folder / "run.json").write_text(record if isinstance(record, str) else json.dumps(record), encoding="utf-8")
-    return folder
-
-
-def test_a_whole_product(tmp_path):
-    assert product_in(write_product(tmp_path / "A", RECORD)) == ("k", "A", 3, 12.5, ("few points",))
-
-
-@pytest.mark.parametrize("file", ["A.gpkg", "A_dtm.tif", "run.json"])
-def test_a_product_that_lacks_a_file(tmp_path, file):
-    folder = write_product(tmp_path / "A", RECORD)
-    (folder / file).unlink()
-    assert product_in(folder) is None
-
-
-@pytest.mark.parametrize("content", [b"123", b"12345", b""])
-def test_a_product_with_a_file_of_another_size(tmp_path, content):
-    folder = write_product(tmp_path / "A", RECORD)
-    (folder / "A.gpkg").write_bytes(content)
-    assert product_in(folder) is None
-
-
-@pytest.mark.parametrize("name", list(RECORD))
-@pytest.mark.parametrize("value", [None, 5, [1]])
-def test_a_record_of_something_else(tmp_path, name, value):
-    record = {key: known for key, known in RECORD.items() if key != name}
-    assert product_in(write_product(tmp_path / "A", record)) is None
-    if name in ("counts", "files") or (name == "warnings" and value != [1]):
-        (tmp_path / "A" / "run.json").write_text(json.dumps(RECORD | {name: value}))
-        assert product_in(tmp_path / "A") is None
-
-
-def test_a_torn_record(tmp_path):
-    text = json.dumps(RECORD)
-    folder = write_product(tmp_path / "A", text)
-    assert product_in(folder)
-    for n in range(len(text)):
-        (folder / "run.json").write_text(text[:n])
-        assert product_in(folder) is None
-    for other in (b"[]", b"null", b"\xff\xfe", bytes(10)):
-        (folder / "run.json").write_bytes(other)
-        assert product_in(folder) is None
-
-
-def test_no_product(tmp_path):
-    assert product_in(tmp_path / "none") is None
-    (tmp_path / "A").touch()
-    assert product_in(tmp_path / "A") is None
 
 
 def test_a_parcel_that_is_called_as_its_cloud_takes_the_only_polygon_and_says_so(tmp_path):
