@@ -1,4 +1,4 @@
-"""Jobs with made-up work, and a folder in which surveys arrive."""
+"""Jobs with made-up work, a folder in which surveys arrive, and a process that works."""
 
 import doubles
 import pytest
@@ -7,6 +7,7 @@ from squares import Job
 
 from vinemap.jobs import survey
 from vinemap.jobs.plan import DONE
+from vinemap.jobs.workers import Worker
 
 
 @pytest.fixture
@@ -27,3 +28,10 @@ def done(job):
 def place(tmp_path):
     (tmp_path / "in").mkdir()
     return tmp_path / "in"
+
+
+@pytest.fixture(scope="module")
+def worker():
+    one = Worker()
+    yield one
+    one.close()
