@@ -209,6 +209,15 @@ def test_what_is_no_date_is_none_and_told(path):
     assert said == [f"dates of the register that are none count as empty: {odd}: write them as 2026-05-31"]
 
 
+def test_what_is_odd_is_told_where_products_are_put_in(registered, path):
+    """Then or never, as it is mended by that."""
+    edit(path, twice)
+    product = registered.parent / "june" / "F"
+    stay = f"F: 5 rows are in the register, and stay as they are → {path}"
+    assert list(register_products([product], path)) == [stay, f"{path}: {LOST.format(1, '2 F')}"]
+    assert list(register_products([product], path)) == [stay]
+
+
 def test_what_others_left_in_its_tables(path):
     """Candidates of no parcel or date, a past of no row, a table without a key."""
     executed(

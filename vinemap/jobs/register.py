@@ -207,7 +207,7 @@ class _Product(NamedTuple):
 
 
 def register_products(products: Iterable[Path], path: Path, *, how: str | None = None) -> Iterator[str]:
-    """Put the rows of products into a register, and say so in a line for each.
+    """Put the rows of products into a register, and say so in a line for each, and then what is odd in the register.
 
     Of a parcel in which the register has rows these stay as they are.
 
@@ -236,15 +236,15 @@ def register_products(products: Iterable[Path], path: Path, *, how: str | None =
 
     def change(register: Register) -> Update:
         settled = settle(register, today(), {})
-        past = register.past
         for one in given:
-            settled, past, words = _put(one, settled, past, register, how)
-            told.append(f"{one.parcel}: {words}")
+            settled, words = _put(one, settled, register, how)
+            told.append(f"{one.parcel}: {words} → {path}")
+        told.extend(f"{path}: {remark}" for remark in settled.remarks)
         taken = settled.rows.loc[settled.rows["grubbed"].isna(), "parcel"].dropna().unique()
         return Update(settled.rows, settled.entries, (), sorted(taken))
 
     update_register(path, change)
-    yield from (f"{line} → {path}" for line in told)
+    yield from told
 
 
 def _product(product: Path) -> _Product:
@@ -258,13 +258,11 @@ def _product(product: Path) -> _Product:
     return _Product(parcel, str(record.get("survey") or parcel), str(record["flown"])[:10], rows)
 
 
-def _put(
-    one: _Product, settled: Settled, past: pd.DataFrame, register: Register, how: str | None
-) -> tuple[Settled, pd.DataFrame, str]:
+def _put(one: _Product, settled: Settled, register: Register, how: str | None) -> tuple[Settled, str]:
     """Put a product's rows into those of a register; what became of them in words."""
-    found, rows = _found(one.rows, register), settled.rows
+    found, rows, past = _found(one.rows, register), settled.rows, register.past
     if len(found) == 0:
-        return settled, past, "no row was found, and none is registered"
+        return settled, "no row was found, and none is registered"
     around = shapely.buffer(shapely.union_all(one.rows.geometry.to_numpy()).convex_hull, SPACING)
     placed = project(rows["line"].where(are_lines(rows), None).to_numpy(), register.crs, one.rows.crs)
     beside = shapely.intersects(placed, around) & (rows["parcel"].fillna(one.parcel) == one.parcel).to_numpy()
@@ -275,7 +273,7 @@ def _put(
     n, extra = int(standing.sum()), int(new.sum())
     if n and not how:
         more = f"; {extra} of the product's aren't among them: --add takes them in" if extra else ""
-        return settled, past, f"{n} rows are in the register, and stay as they are{more}"
+        return settled, f"{n} rows are in the register, and stay as they are{more}"
     first = not beside.any()
     names = {"parcel": one.parcel, "survey": one.survey, "since": one.flown, "fid": None, "dirty": True}
     fresh = found[new].assign(**NONE, **names)
@@ -293,10 +291,10 @@ def _put(
     changed = rows.iloc[len(rows) - len(fresh) :].assign(what="found")
     changed = pd.concat([changed, rows.loc[gone[:ended]].assign(what=f"grubbed up {one.flown}")])
     entries = changed.assign(by=one.survey, date=one.flown)[settled.entries.columns]
-    settled = Settled(rows, pd.concat([settled.entries, entries], ignore_index=True), settled.remarks)
+    settled = settled._replace(rows=rows, entries=pd.concat([settled.entries, entries], ignore_index=True))
     words = f"rows registered: {len(fresh)}"
     words += f", there before: {n - len(gone)}" if n else ""
-    return settled, past, words + (f", there no more: {ended}" if ended else "")
+    return settled, words + (f", there no more: {ended}" if ended else "")
 
 
 def _matched(
