@@ -4,10 +4,11 @@ import json
 import math
 from xml.etree import ElementTree as ET
 
+import isoxml_writer
 import numpy as np
-import pytest
 import shapely
 from exports import NAME, assert_same, few, in_grid
+from lxml import etree
 
 from vinemap.export.write import export_products
 
@@ -56,9 +57,7 @@ def points(line):
 
 
 def test_isoxml_holds_to_the_schema_of_iso_11783_10(exported):
-    schemas = pytest.importorskip("isoxml_writer", reason="brings the schema of ISO 11783-10").__path__[0]
-    etree = pytest.importorskip("lxml.etree", reason="checks XML against it")
-    schema = etree.XMLSchema(file=f"{schemas}/ISOXML_schema/ISO11783_TaskFile_V4-3.xsd")
+    schema = etree.XMLSchema(file=f"{isoxml_writer.__path__[0]}/ISOXML_schema/ISO11783_TaskFile_V4-3.xsd")
     assert schema.validate(etree.parse(exported / "isoxml" / "TASKDATA" / "TASKDATA.XML")), schema.error_log
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from commands import here
 from products import SURVEYS, map_here, tree
+from systems import LINUX
 
 import vinemap
 from vinemap.config.surveys import survey_config
@@ -20,8 +21,6 @@ from vinemap.jobs.dask import DaskWorkers
 from vinemap.jobs.plan import DONE
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import follow
-
-pytest.importorskip("distributed", reason="needs Dask: pip install 'vinemap[dask]'")
 
 
 def start(*words, cwd):
@@ -108,7 +107,7 @@ def worker_of(pid):
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@LINUX
 def test_a_worker_that_is_killed_costs_nothing_but_time(cluster, three, tmp_path, monkeypatch):
     """Nor do calls that crash cost the cluster a worker."""
     monkeypatch.setattr(survey, "follow", misbehave)

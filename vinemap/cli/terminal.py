@@ -8,6 +8,7 @@ import signal
 import sys
 from contextlib import contextmanager
 from io import TextIOWrapper
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
@@ -100,8 +101,8 @@ def hushed() -> Iterator[None]:
         return
     ours.flush()
     with (
-        open(os.dup(2), "w", buffering=1, encoding=ours.encoding, errors=ours.errors) as people,  # noqa: PTH123
-        open(os.devnull, "wb") as nobody,  # noqa: PTH123
+        os.fdopen(os.dup(2), "w", buffering=1, encoding=ours.encoding, errors=ours.errors) as people,
+        Path(os.devnull).open("wb") as nobody,
     ):
         os.dup2(nobody.fileno(), 2)
         sys.stderr = people

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import geopandas as gpd  # noqa: TC002  (its type stands in public signatures)
 import numpy as np
 import pandas as pd
 import shapely
@@ -13,6 +12,8 @@ from scipy.spatial import cKDTree
 from vinemap.geo.raster import Raster, sample_across
 
 if TYPE_CHECKING:
+    import geopandas as gpd
+
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.surfaces.seen import Seen
 

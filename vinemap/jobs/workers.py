@@ -270,7 +270,7 @@ def _listen(calls: IO[bytes], inbox: queue.SimpleQueue[bytes]) -> None:
     try:
         while True:
             inbox.put(_receive(calls))
-    except BaseException:  # noqa: BLE001
+    finally:
         os._exit(0)
 
 

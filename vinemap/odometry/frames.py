@@ -9,7 +9,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from itertools import islice
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -208,7 +208,7 @@ def _image(path: Path) -> Frame:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return Frame(path.name, time, None, "unreadable")
-    return Frame(path.name, time, image)  # type: ignore[arg-type]
+    return Frame(path.name, time, cast("Image", image))
 
 
 def _exif_time(path: Path) -> float | None:
@@ -256,7 +256,8 @@ def _video(path: Path, length: int) -> Iterator[Frame]:
                 yield Frame(f"{path.name} {lost}", None, None, "unreadable")
             missed = 0
             time = None if bare else video.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            yield Frame(f"{path.name} {number}", time, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))  # type: ignore[arg-type]
+            grey = cast("Image", cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            yield Frame(f"{path.name} {number}", time, grey)
     finally:
         video.release()
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, uniform_filter
 
 from vinemap.compute.threads import in_threads
-from vinemap.geo.raster import cell_of, sample, sample_across
+from vinemap.geo.raster import sample, sample_across
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
@@ -136,10 +136,7 @@ def _nodes(field: RowField, grid: Grid, step: float, min_likelihood: float) -> t
     x = np.arange(grid.west + step / 2, grid.west + grid.nx * grid.resolution, step)
     y = np.arange(grid.north - step / 2, grid.north - grid.ny * grid.resolution, -step)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    cell = cell_of(xy, field.direction.grid)
-    direction, spacing, likelihood = (
-        r.values.ravel()[cell] for r in (field.direction, field.spacing, field.likelihood)
-    )
+    direction, spacing, likelihood = field.at(xy)
     likely = (likelihood >= min_likelihood) & np.isfinite(direction) & np.isfinite(spacing)
     nodes: Values = np.column_stack([xy, np.radians(direction), spacing])[likely]
     return nodes, np.argwhere(likely.reshape(len(y), len(x)))

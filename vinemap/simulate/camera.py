@@ -199,7 +199,8 @@ def _photograph(name: str) -> Values:
         from skimage import data
     except ImportError as error:
         raise DependencyError(f"The photograph of {name} comes with scikit-image: pip install scikit-image") from error
-    return getattr(data, name)().astype(np.float32)  # type: ignore[no-any-return]
+    photograph: Values = getattr(data, name)().astype(np.float32)
+    return photograph
 
 
 def _file(path: Path) -> Values:

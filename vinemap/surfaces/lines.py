@@ -13,7 +13,6 @@ from vinemap.errors import InputError
 from vinemap.geo.crs import project
 from vinemap.geo.curve import resample
 from vinemap.geo.layers import some_of
-from vinemap.geo.raster import cell_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -122,8 +121,7 @@ def _told_by(field: RowField, line: shapely.LineString) -> float:
     """Spacing in metres that a row field tells along a line; NaN where there are no rows along it."""
     curve = resample(shapely.get_coordinates(line), STEP)
     way = np.gradient(curve, axis=0)
-    cells = cell_of(curve, field.spacing.grid)
-    direction, spacing = (one.values.ravel()[cells] for one in (field.direction, field.spacing))  # noqa: PD011 - no frames
+    direction, spacing, _ = field.at(curve)
     turn = np.abs(np.cos(np.radians(direction) - np.arctan2(way[:, 1], way[:, 0])))
     along = (turn >= PARALLEL) & np.isfinite(spacing)
     return float(np.median(spacing[along])) if along.mean() > 0.5 else np.nan

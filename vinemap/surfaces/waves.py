@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
+from vinemap.geo.raster import cell_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -242,3 +243,11 @@ class RowField:
     likelihood: Raster
     square: bool = False
     """Whether somewhere two directions were about as good, as where vines are planted in a square."""
+
+    def at(self, xy: Values) -> tuple[Values, Values, Values]:
+        """Direction, spacing and likelihood (n,) of the cells that hold points (n, ≥2)."""
+        cell = cell_of(xy, self.direction.grid)
+        direction, spacing, likelihood = (
+            raster.values.ravel()[cell] for raster in (self.direction, self.spacing, self.likelihood)
+        )
+        return direction, spacing, likelihood

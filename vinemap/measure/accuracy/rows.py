@@ -9,7 +9,7 @@ import pandas as pd
 import shapely
 
 from vinemap.evaluate.rows import evaluate_rows
-from vinemap.geo.raster import Raster, cell_of, sample
+from vinemap.geo.raster import Raster, sample
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -114,12 +114,11 @@ def _field_errors(rows: NDArray[np.object_], field: RowField) -> tuple[Floats, F
     if len(xy) == 0:
         return np.empty(0), np.empty(0)
     way = ahead - back
-    cells = cell_of(xy, field.direction.grid)
-    there = [raster.values.ravel()[cells] for raster in (field.direction, field.spacing)]  # noqa: PD011 - no frames
-    turn = there[0] - np.degrees(np.arctan2(way[:, 1], way[:, 0]))
+    told, told_spacing, _ = field.at(xy)
+    turn = told - np.degrees(np.arctan2(way[:, 1], way[:, 0]))
     direction = np.abs((turn + 90) % 180 - 90)
     wanted = _true_spacing(rows, row, xy, way / np.hypot(*way.T)[:, None])
-    spacing = np.abs(there[1] / wanted - 1)
+    spacing = np.abs(told_spacing / wanted - 1)
     return np.nan_to_num(direction, nan=90.0), np.nan_to_num(spacing, nan=1.0)[np.isfinite(wanted)]
 
 
