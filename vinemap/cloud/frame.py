@@ -9,14 +9,15 @@ import shapely
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import at, tangents, way_along
-from vinemap.geo.raster import cell_at, grid_over
+from vinemap.geo.curve import at_each, tangents_of_each, way_along
+from vinemap.geo.raster import cell_at, grid_over, nearest_cell
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from vinemap.cloud.bins import Bins
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Ints, Values
@@ -74,13 +75,14 @@ def points_of_rows(
     """
     if not curves:
         return
+    guides = _guides(curves)
     for rows in _groups(curves, cloud.size):
-        lookup = _lookup(curves, reach, rows)
+        lookup = _lookup(guides, np.concatenate([curves[k] for k in rows]), float(reach.max()) + GUIDE)
         within = np.full(len(curves), -1.0)
         within[rows] = reach[rows]
         found = []
         for part in cloud.parts(shapely.MultiLineString([curves[k] for k in rows]), float(reach[rows].max())):
-            near = _coordinates(part.xyz, lookup, within)
+            near = _coordinates(part, lookup, within)
             found.append((near._replace(member=near.member + np.int32(part.first)), take(part, near.member)))
         yield rows, *_joined(found, rows)
 
@@ -106,31 +108,61 @@ def _joined(found: Sequence[tuple[RowCoordinates, Taken]], rows: Ints) -> tuple[
     return RowCoordinates(start, *columns[:3]), tuple(columns[3:])
 
 
-def _lookup(curves: Sequence[Values], reach: Values, rows: Ints) -> _Lookup:
-    """Guides of all curves, and the nearest ones about some of the rows."""
-    lengths = [float(way_along(curve)[-1]) for curve in curves]
-    positions = [np.linspace(0, length, max(2, round(length / GUIDE) + 1)) for length in lengths]
-    guides = _Guides(
-        np.concatenate([np.full(len(g), k) for k, g in enumerate(positions)]),
-        np.concatenate(positions),
-        np.concatenate([at(curve, g) for curve, g in zip(curves, positions, strict=True)]),
-        np.concatenate([tangents(curve, g) for curve, g in zip(curves, positions, strict=True)]),
+def _guides(curves: Sequence[Values]) -> _Guides:
+    lengths = np.array([way_along(curve)[-1] for curve in curves])
+    n = np.maximum(np.round(lengths / GUIDE).astype(int) + 1, 2)
+    row = np.repeat(np.arange(len(curves)), n)
+    along = (np.arange(len(row)) - (np.cumsum(n) - n)[row]) * (lengths / (n - 1))[row]
+    return _Guides(row, along, at_each(curves, row, along), tangents_of_each(curves, row, along))
+
+
+def _lookup(guides: _Guides, about: Values, reach: float) -> _Lookup:
+    """The nearest guides within metres of some points (n, 2)."""
+    grid = grid_over(about.min(axis=0) - reach, about.max(axis=0) + reach, resolution=GUIDE)
+    return _Lookup(grid, _nearest_guides(guides.xy, grid, reach), guides)
+
+
+def _coordinates(part: PointCloud, lookup: _Lookup, reach: Values) -> RowCoordinates:
+    points = np.ascontiguousarray(part.xyz)
+    chosen = (
+        _in_cells(part.kept_bins, lookup.grid, lookup.nearest)
+        if part.kept_bins
+        else np.arange(part.size, dtype=np.int32)
     )
-    widest = float(reach.max()) + GUIDE
-    about = np.concatenate([curves[k] for k in rows])
-    grid = grid_over(about.min(axis=0) - widest, about.max(axis=0) + widest, resolution=GUIDE)
-    return _Lookup(grid, _nearest_guides(guides.xy, grid, widest), guides)
-
-
-def _coordinates(xyz: Values, lookup: _Lookup, reach: Values) -> RowCoordinates:
-    points = np.ascontiguousarray(xyz)
-    guide, parts = np.empty(len(points), dtype=np.int32), stretches(len(points))
-    counts = np.array(in_threads(lambda part: _find_guides(*part, points, lookup, reach, guide), parts))
+    guide, parts = np.empty(len(chosen), dtype=np.int32), stretches(len(chosen))
+    counts = np.array(in_threads(lambda of: _find_guides(*of, points, chosen, lookup, reach, guide), parts))
     start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     place = start[:-1] + np.cumsum(counts, axis=0) - counts
     along, left = np.empty((2, start[-1]), dtype=np.float32)
     out = RowCoordinates(start, along, left, np.empty(start[-1], dtype=np.int32))
-    in_threads(lambda k: _refer(*parts[k], points, guide, lookup.guides, place[k], out), range(len(parts)))
+    in_threads(lambda k: _refer(*parts[k], points, chosen, guide, lookup.guides, place[k], out), range(len(parts)))
+    return out
+
+
+@compiled
+def _in_cells(bins: Bins, grid: Grid, nearest: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Points in the cells that touch those of a lookup (ny, nx) with a guide."""
+    start, member = bins.start, bins.member
+    marked = np.zeros(len(start) - 1, dtype=np.bool_)
+    n = 0
+    for i in range(grid.ny):
+        for j in range(grid.nx):
+            if nearest[i, j] >= 0:
+                x, y, side = grid.west + j * grid.resolution, grid.north - i * grid.resolution, grid.resolution
+                top, left = nearest_cell(bins.grid, x, y)
+                bottom, right = nearest_cell(bins.grid, x + side, y - side)
+                for a in range(top, bottom + 1):
+                    for cell in range(a * bins.grid.nx + left, a * bins.grid.nx + right + 1):
+                        if not marked[cell]:
+                            marked[cell] = True
+                            n += start[cell + 1] - start[cell]
+    out = np.empty(n, dtype=np.int32)
+    n = 0
+    for cell in range(len(marked)):
+        if marked[cell]:
+            for k in range(start[cell], start[cell + 1]):
+                out[n] = member[k]
+                n += 1
     return out
 
 
@@ -159,22 +191,24 @@ def _find_guides(
     first: int,
     last: int,
     xyz: Values,
+    chosen: NDArray[np.int32],
     lookup: _Lookup,
     reach: Values,
     guide: NDArray[np.int32],
 ) -> Ints:
-    """Guide (n,) to which each point (n, ≥2) is referred, -1 where it is out of its row's reach; points of each row."""
+    """Guide (n,) to which each chosen point is referred, -1 where it is out of its row's reach; points of each row."""
     grid, nearest, guides = lookup
     n = np.zeros(len(reach), dtype=np.int64)
-    for p in range(first, last):
-        guide[p] = -1
+    for k in range(first, last):
+        p = chosen[k]
+        guide[k] = -1
         i, j = cell_at(grid, xyz[p, 0], xyz[p, 1])
         g = nearest[i, j] if 0 <= i < grid.ny and 0 <= j < grid.nx else -1
         if g < 0:
             continue
         x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
         if abs(guides.tangent[g, 0] * y - guides.tangent[g, 1] * x) <= reach[guides.row[g]]:
-            guide[p] = g
+            guide[k] = g
             n[guides.row[g]] += 1
     return n
 
@@ -184,14 +218,15 @@ def _refer(
     first: int,
     last: int,
     xyz: Values,
+    chosen: NDArray[np.int32],
     guide: NDArray[np.int32],
     guides: _Guides,
     place: Ints,
     out: RowCoordinates,
 ) -> None:
-    """Write the coordinates of the points (n, ≥2) that have a guide, each row's from its place (rows,) on."""
-    for p in range(first, last):
-        g = guide[p]
+    """Write the coordinates of the chosen points (n,) that have a guide, each row's from its place (rows,) on."""
+    for c in range(first, last):
+        p, g = chosen[c], guide[c]
         if g >= 0:
             x, y = xyz[p, 0] - guides.xy[g, 0], xyz[p, 1] - guides.xy[g, 1]
             k = place[guides.row[g]]

@@ -63,15 +63,16 @@ class PointCloud:
         yield self
 
     def bins(self, grid: Grid) -> Bins:
-        """The points sorted into the cells of a grid; kept until another grid's are asked for, or all is forgotten."""
+        """The points sorted into the cells of a grid; kept until another grid's are asked for."""
         if "bins" not in self._kept or self._kept["bins"].grid != grid:
             self._kept["bins"] = bin_points(self.xyz, grid)
         bins: Bins = self._kept["bins"]
         return bins
 
-    def forget(self) -> None:
-        """Give back the memory of what is kept for speed."""
-        self._kept.clear()
+    @property
+    def kept_bins(self) -> Bins | None:
+        """The points sorted into cells, where they were before."""
+        return self._kept.get("bins")
 
     def above(self, dtm: Raster, ceiling: Raster | None = None) -> PointCloud:
         """The cloud with its heights above a terrain model; what is higher than a ceiling is ``HIDDEN``."""

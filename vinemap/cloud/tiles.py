@@ -72,9 +72,6 @@ class TiledCloud:
                 part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
                 yield part.above(self.dtm, self.ceiling) if self.dtm else part
 
-    def forget(self) -> None:
-        """Nothing is kept for speed."""
-
     def above(self, dtm: Raster, ceiling: Raster | None = None) -> TiledCloud:
         """The cloud with its heights above a terrain model; what is higher than a ceiling is hidden."""
         return replace(self, dtm=dtm, ceiling=ceiling)

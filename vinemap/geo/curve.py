@@ -10,7 +10,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.sparse.linalg import spsolve
 
 if TYPE_CHECKING:
-    from vinemap.compute.arrays import Values
+    from collections.abc import Sequence
+
+    from vinemap.compute.arrays import Ints, Values
 
 
 def at(curve: Values, position: Values) -> Values:
@@ -19,9 +21,26 @@ def at(curve: Values, position: Values) -> Values:
     return np.column_stack([np.interp(position, way, curve[:, k]) for k in (0, 1)])
 
 
+def at_each(curves: Sequence[Values], which: Ints, position: Values) -> Values:
+    """Points (m, 2) of several curves (n, 2), which of them (m,), at metres (m,) along it, as of :func:`at`."""
+    points = np.concatenate(curves)
+    first = np.cumsum([0, *(len(curve) for curve in curves[:-1])])
+    way = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T)])
+    way[first] = 1.0
+    way = np.cumsum(way)
+    last = way[[*(first[1:] - 1), len(way) - 1]]
+    along = way[first][which] + np.clip(position, 0.0, (last - way[first])[which])
+    return np.column_stack([np.interp(along, way, points[:, k]) for k in (0, 1)])
+
+
 def tangents(curve: Values, position: Values) -> Values:
     """Unit tangents (m, 2) of a curve (n, 2) at metres (m,) along it, over half a metre."""
-    chord = at(curve, position + 0.25) - at(curve, position - 0.25)
+    return tangents_of_each([curve], np.zeros(len(position), dtype=int), position)
+
+
+def tangents_of_each(curves: Sequence[Values], which: Ints, position: Values) -> Values:
+    """Unit tangents (m, 2) of several curves (n, 2), which of them (m,), at metres (m,) along it, over half a metre."""
+    chord = at_each(curves, which, position + 0.25) - at_each(curves, which, position - 0.25)
     out: Values = chord / np.hypot(*chord.T)[:, None]
     return out
 

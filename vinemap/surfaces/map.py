@@ -31,5 +31,4 @@ def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Rast
     dtm = terrain_model(points, **settings.ground.model_dump())
     cloud, chm = heights_of_vines(points, dtm, resolution=settings.ground.resolution, high=settings.cover.high)
     seen = seen_cells(points, grid_over(*points.extent, resolution=settings.cover.resolution))
-    cloud.forget()
     return cloud, dtm, chm, seen
