@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import sparse
+from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
-from scipy.sparse.linalg import spsolve
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,9 +84,12 @@ def smoothed(curve: Values, *, wavelength: float, beyond: float, step: float) ->
     known = np.pad(resample(curve, step), [(n, n), (0, 0)])
     weight = np.pad(np.ones(len(known) - 2 * n), n)
     # Third differences: neither the smoothing nor what is carried on straightens an arc.
-    third = sparse.diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(len(known) - 3, len(known)))
-    penalty = (wavelength / step / (2 * np.pi)) ** 6 * (third.T @ third)
+    third, bands = (-1.0, 3.0, -3.0, 1.0), np.zeros((4, len(known)))
+    bands[0] = weight
+    stiffness = (wavelength / step / (2 * np.pi)) ** 6
+    for i, a in enumerate(third):
+        for j, b in enumerate(third[: i + 1]):
+            bands[i - j, j : len(known) - 3 + j] += stiffness * a * b
     origin = curve[0]
-    smooth = spsolve(sparse.csc_array(penalty + sparse.diags_array(weight)), weight[:, None] * (known - origin))
-    out: Values = origin + smooth
+    out: Values = origin + solveh_banded(bands, weight[:, None] * (known - origin), lower=True)
     return out

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, shift
 
 from vinemap.compute.compiled import compiled
+from vinemap.compute.order import quantile
 from vinemap.geo.curve import normals
 from vinemap.geo.raster import sample, sample_across
 
@@ -64,23 +65,7 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float, 
     strength = np.quantile(smooth.max(axis=1), 0.7)
     # Within the canopy cover tells how well it was seen; its middle is that of its flanks.
     excess = np.clip(smooth - BACKGROUND * strength, 0, (FULL - BACKGROUND) * strength)
-    centre: Values = np.zeros(len(image))
-    for _ in range(4):
-        before = centre
-        amount, moment = _centroids(excess, offsets, centre, reach)
-        # Stations of a stray leaf or two tell nothing of the row's middle.
-        typical = float(np.quantile(amount, 0.7))
-        weight = amount * np.clip(2 * amount / max(typical, 1e-9) - 0.5, 0, 1)
-        measured = moment / np.maximum(amount, 1e-9)
-        robust = np.ones(len(image))
-        for _ in range(3):
-            centre = _smoothed(measured, weight * robust, cutoff)
-            residual = np.abs(measured - centre)
-            scale = 1.5 * np.median(residual[weight > 0]) + 0.01 if (weight > 0).any() else 1.0
-            robust = 1 / (1 + (residual / (2 * scale)) ** 2)
-        if np.abs(centre - before).max() < SETTLED:
-            break
-    return centre
+    return _centre(excess, offsets, reach, cutoff)
 
 
 def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
@@ -92,16 +77,38 @@ def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
 
 
 @compiled
-def _centroids(excess: Values, offsets: Values, centre: Values, reach: float) -> tuple[Values, Values]:
-    """Sums (n,) of canopy (n, m) within reach of a centre (n,), plain and times its offset (m,)."""
-    amount, moment = np.zeros(len(excess)), np.zeros(len(excess))
-    for i in range(len(excess)):
-        for j in range(len(offsets)):
-            # A soft edge, so that a cell more or less doesn't move the centroid.
-            soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
-            amount[i] += excess[i, j] * soft
-            moment[i] += excess[i, j] * soft * offsets[j]
-    return amount, moment
+def _centre(excess: Values, offsets: Values, reach: float, cutoff: float) -> Values:
+    """Smoothed centroids (n,) of canopy (n, m) within reach of them."""
+    n = len(excess)
+    centre, measured, weight, robust, sorted_ = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for _ in range(4):
+        for i in range(n):
+            amount, moment = 0.0, 0.0
+            for j in range(len(offsets)):
+                # A soft edge, so that a cell more or less doesn't move the centroid.
+                soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
+                amount += excess[i, j] * soft
+                moment += excess[i, j] * soft * offsets[j]
+            measured[i], weight[i], sorted_[i] = moment / max(amount, 1e-9), amount, amount
+        # Stations of a stray leaf or two tell nothing of the row's middle.
+        typical = max(quantile(sorted_, n, 0.7), 1e-9)
+        for i in range(n):
+            weight[i] *= min(max(2 * weight[i] / typical - 0.5, 0.0), 1.0)
+            robust[i] = 1.0
+        before = centre
+        for _ in range(3):
+            centre = _smoothed(measured, weight * robust, cutoff)
+            held = 0
+            for i in range(n):
+                if weight[i] > 0:
+                    sorted_[held] = abs(measured[i] - centre[i])
+                    held += 1
+            scale = 1.5 * quantile(sorted_, held, 0.5) + 0.01 if held else 1.0
+            for i in range(n):
+                robust[i] = 1 / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
+        if np.abs(centre - before).max() < SETTLED:
+            break
+    return centre
 
 
 def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:

@@ -234,17 +234,14 @@ def _deal(
     touching = bool(levels.touching.any())
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
-        def above(level: Raster) -> Values:
-            canopy = np.zeros(len(member), dtype=np.float32)
-            at = vines, (level.values, level.grid)
-            in_threads(
-                lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, at, high, canopy),
-                stretches(len(canopy)),
-            )
-            return canopy
-
-        body = above(levels.body)
-        return body, above(levels.ridge) if touching else body
+        body = np.zeros(len(member), dtype=np.float32)
+        ridge = np.zeros(len(member) if touching else 0, dtype=np.float32)
+        at = vines, (levels.body.values, levels.ridge.values, levels.body.grid)
+        in_threads(
+            lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, at, high, body, ridge),
+            stretches(len(member)),
+        )
+        return body, ridge if touching else body
 
     for rows, near, (body, ridge) in points_of_rows(cloud, curves, half + REACH, canopy_of):
         shares = []
@@ -265,19 +262,22 @@ def _weigh(
     xyz: Values,
     heights: Values,
     member: NDArray[np.int32],
-    at: tuple[tuple[Flags, Grid], tuple[Values, Grid]],
+    at: tuple[tuple[Flags, Grid], tuple[Values, Values, Grid]],
     high: float,
-    canopy: Values,
+    body: Values,
+    ridge: Values,
 ) -> None:
-    """How far members (n,) of a cloud are canopy, 0 to 1: from the level up to a height, where there are vines."""
-    vines, level = at
+    """How far members (n,) of a cloud are canopy, 0 to 1: from the levels up to a height, where there are vines."""
+    vines, (of_body, of_ridge, grid) = at
     for k in range(first, last):
         p = member[k]
         i, j = nearest_cell(vines[1], xyz[p, 0], xyz[p, 1])
         if vines[0][i, j]:
-            a, b = nearest_cell(level[1], xyz[p, 0], xyz[p, 1])
-            rise = min(max((heights[p] - level[0][a, b]) / RAMP + 0.5, 0.0), 1.0)
-            canopy[k] = rise * min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
+            a, b = nearest_cell(grid, xyz[p, 0], xyz[p, 1])
+            fall = min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
+            body[k] = fall * min(max((heights[p] - of_body[a, b]) / RAMP + 0.5, 0.0), 1.0)
+            if len(ridge):
+                ridge[k] = fall * min(max((heights[p] - of_ridge[a, b]) / RAMP + 0.5, 0.0), 1.0)
 
 
 def _noise_stretch(share: _Share) -> float:
