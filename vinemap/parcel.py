@@ -7,7 +7,7 @@ import shutil
 import time
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from vinemap import paths
 from vinemap.canopy.classification import classify_points
@@ -20,6 +20,7 @@ from vinemap.cloud.pieces import read_piece
 from vinemap.cloud.tiles import Collector, moved
 from vinemap.cloud.write import write_classified
 from vinemap.compute import machine
+from vinemap.compute.threads import aside
 from vinemap.config.names import check_parcel
 from vinemap.config.settings import Settings
 from vinemap.evaluate.confidence import believed, judge_rows
@@ -31,7 +32,7 @@ from vinemap.geo.crs import project
 from vinemap.geo.main import check_near, corner_of
 from vinemap.product import store
 from vinemap.product.layers import labelled, parcel_layer
-from vinemap.product.pages.parcel import write_page
+from vinemap.product.rasters import rasters_of, write_rasters
 from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.product.record import Summary, record_of
 from vinemap.product.stac import write_item
@@ -258,7 +259,7 @@ def follow(
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
-    with store.product(folder, drafts=drafts, within=within) as draft:
+    with store.product(folder, drafts=drafts, within=within) as draft, aside() as beside:
         points = _read(recipe, piece, draft, run)
         if origin:
             check_near(origin, points.extent[0], points.crs)
@@ -268,8 +269,9 @@ def follow(
         if known is not None and settings.rows.align and (shift := map_rows(points, settings, known=known).shift):
             points = moved(points, -shift.metres, _collector(settings, paths.tiles(draft) / "moved"))
         found = map_rows(points, settings, within=polygon, known=known, step=run)
-        shift = shift or found.shift
-        model, apart = model_canopies(found, settings, step=run), settings.sections.step
+        shift, surfaces = shift or found.shift, (found.dtm, found.chm)
+        written = beside(write_rasters, draft, parcel, rasters := rasters_of(*surfaces, found.field))
+        model, apart, high = model_canopies(found, settings, step=run), settings.sections.step, settings.cover.high
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
@@ -278,7 +280,6 @@ def follow(
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, model.table, found.cover, **given)
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
         outlines = parcel_layer(parcel, rows, polygon, points)
-        around = outlines if polygon else None
         layers = {
             "rows": rows,
             "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
@@ -286,24 +287,25 @@ def follow(
             "sections": labelled(model.table, rows),
             "gaps": labelled(gaps, rows),
             "vines": labelled(vines, rows),
-            "unmapped": run("Unmapped", find_unmapped, found.chm, rows, around, tallest=settings.cover.high),
+            "unmapped": run("Unmapped", find_unmapped, found.chm, rows, outlines if polygon else None, tallest=high),
             "parcel": outlines,
         }
+        about: dict[str, Any] = {"origin": main, "shift": shift, "square": found.field.square}
+        about |= {"n_key_points": found.n_key_points, "remarks": [*found.remarks, *strays]}
+        record = record_of(recipe, found.cloud, layers, surfaces, **about)
 
-        def write() -> None:
-            how: dict[str, Any] = {"date": recipe.flown} | settings.product.model_dump(include={"plain", "geoid"})
-            write_product(draft, parcel, layers, (found.dtm, found.chm), found.field, meshes, points, **how)
+        def write() -> list[str]:
+            how = settings.product.model_dump(include={"plain", "geoid"})
+            remarks = write_product(draft, record, layers, rasters, meshes, points, **how)
             if settings.product.classified:
                 cut = found.cloud, found.rows, found.gaps, found.dtm
                 classify = partial(classify_points, leaves=find_leaves(*cut, settings))
                 write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
+            written.result()
+            return remarks
 
-        run("Writing", write)
-        about: dict[str, Any] = {"n_key_points": found.n_key_points, "square": found.field.square}
-        about |= {"remarks": [*found.remarks, *strays], "shift": shift}
-        record = record_of(recipe, found.cloud, layers, (found.dtm, found.chm), origin=main, **about)
+        record["warnings"] += run("Writing", write)
         shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        record["warnings"] += write_page(draft, record, layers, found.dtm, found.chm)
         write_item(draft, recipe, record, layers["parcel"])
         record |= {
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -318,10 +320,9 @@ def follow(
 def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:
     """The points that a recipe asks for, in memory or in tiles beside the draft."""
     settings, collector = recipe.settings, _collector(recipe.settings, paths.tiles(draft))
-    points: Cloud
     if piece:
-        points = run("Reading", read_piece, piece, collector)
-        return points
+        return cast("Cloud", run("Reading", read_piece, piece, collector))
+    points: Cloud
     how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
     if settings.ground.engine == "pdal":
         points = run("Reading", read_cloud_pdal, recipe.clouds, **how)

@@ -33,7 +33,7 @@ def select(values: Values, first: int, last: int, rank: int) -> float:
             low = i
         else:
             break
-    return values[rank]
+    return float(values[rank])
 
 
 @compiled
@@ -47,4 +47,4 @@ def quantile(values: Values, n: int, q: float) -> float:
     upper = values[rank + 1]
     for k in range(rank + 2, n):
         upper = min(upper, values[k])
-    return lower + (at - rank) * (upper - lower)
+    return float(lower + (at - rank) * (upper - lower))

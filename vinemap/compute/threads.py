@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinemap.compute import machine
 
@@ -52,6 +52,20 @@ if hasattr(os, "register_at_fork"):
 
 def _mark_busy() -> None:
     _here.busy = True
+
+
+@contextmanager
+def aside() -> Iterator[Callable[..., Future[Any]]]:
+    """Have functions called in another thread, one after the other, while one goes on.
+
+    Given is ``start(function, *args, **kwargs)``, whose result tells when it's done, or its error. When the context
+    ends by an error, what hasn't begun doesn't.
+    """
+    pool = ThreadPoolExecutor(1, initializer=_mark_busy)
+    try:
+        yield pool.submit
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -221,10 +222,15 @@ def write_glb(
         ]
         out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
     # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
-    document = out.gltf_to_json(separators=(",", ":"), indent=None).encode()
+    document = json.dumps(out, default=_properties, separators=(",", ":")).encode()
     binary = _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
     chunks = _chunk(b"JSON", document, b" ") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _properties(part: Any) -> dict[str, Any]:
+    """Those of a part of a glTF document that are told."""
+    return {name: value for name, value in vars(part).items() if value is not None and value not in ({}, [])}
 
 
 def _quantise(centred: Floats) -> tuple[NDArray[np.int16], float]:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vinemap.geo.raster import Raster
+    from vinemap.surfaces.waves import RowField
 
 NODATA = -9999.0
 RASTERS = {
@@ -62,6 +63,11 @@ def write_cog(raster: Raster, path: Path, *, description: str, unit: str, resamp
             target.update_tags(AREA_OR_POINT="Area")
         copy(plain.name, cog.name, driver="COG", **options)
         path.write_bytes(cog.read())
+
+
+def rasters_of(dtm: Raster, chm: Raster, field: RowField) -> dict[str, Raster]:
+    """Rasters of a product by their kinds: terrain, canopy height, and what the row field tells."""
+    return dict(zip(RASTERS, (dtm, chm, field.direction, field.spacing, field.likelihood), strict=True))
 
 
 def write_rasters(folder: Path, parcel: str, rasters: dict[str, Raster]) -> None:

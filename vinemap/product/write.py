@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,53 +16,53 @@ from vinemap.product.geopackage import write_geopackage
 from vinemap.product.globe import parcel_tileset
 from vinemap.product.gltf import write_glb
 from vinemap.product.layers import conform
+from vinemap.product.pages.parcel import write_page
 from vinemap.product.qgis.project import project as qgis_project
-from vinemap.product.rasters import RASTERS, write_rasters
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from datetime import datetime
 
     import geopandas as gpd
 
     from vinemap.canopy.mesh import Mesh
     from vinemap.cloud.tiles import Cloud
     from vinemap.geo.raster import Raster
-    from vinemap.surfaces.waves import RowField
 
 
 def write_product(
     folder: Path,
-    parcel: str,
+    record: dict[str, Any],
     layers: dict[str, gpd.GeoDataFrame],
-    surfaces: tuple[Raster, Raster],
-    field: RowField,
+    rasters: dict[str, Raster],
     meshes: list[Mesh],
     points: Cloud,
     *,
-    date: datetime,
     plain: bool = False,
     geoid: float | None = None,
-) -> None:
-    """Write the files of a product but ``run.json``; ``surfaces`` are terrain and canopy height.
+) -> list[str]:
+    """Write the files of a product but ``run.json``, of which the ``record`` is all else, and its rasters.
 
-    The ``date`` is the survey's. ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the
-    globe, m (:func:`vinemap.geo.geoid.find_geoid`).
+    ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the globe, m
+    (:func:`vinemap.geo.geoid.find_geoid`). What is to be known of what was written is returned: a sentence each.
 
     Raises
     ------
     OSError
         If one can't be written.
     """
-    kinds = dict(zip(RASTERS, (*surfaces, field.direction, field.spacing, field.likelihood), strict=True))
+    parcel, date = record["parcel"], datetime.fromisoformat(record["flown"])
     layers = {name: conform(layer, name) for name, layer in layers.items()}
-    writers: list[Callable[[], None]] = [
+
+    def canopies_and_page() -> list[str]:
+        _write_meshes(folder, parcel, meshes, points, plain=plain, geoid=geoid)
+        return write_page(folder, record, layers, rasters["dtm"], rasters["chm"])
+
+    writers: list[Callable[[], list[str] | None]] = [
         partial(write_geopackage, layers, paths.geopackage(folder, parcel), date=date),
-        partial(write_rasters, folder, parcel, kinds),
-        partial(_write_meshes, folder, parcel, meshes, points, plain=plain, geoid=geoid),
-        partial(_write_project, folder, parcel, layers, kinds, date=date, vertical=points.vertical),
+        canopies_and_page,
+        partial(_write_project, folder, parcel, layers, rasters, date=date, vertical=points.vertical),
     ]
-    in_threads(lambda write: write(), writers)
+    return [remark for told in in_threads(lambda write: write(), writers) for remark in told or ()]
 
 
 def _write_meshes(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, shift
+from scipy.ndimage import shift
 
 from vinemap.compute.compiled import compiled
+from vinemap.compute.filters import CARRIED_ON, blurred_down
 from vinemap.compute.order import quantile
 from vinemap.geo.curve import normals
 from vinemap.geo.raster import sample, sample_across
@@ -61,11 +62,7 @@ def centre_line(image: Values, offsets: Values, *, reach: float, cutoff: float, 
     """
     if curtains:
         image, reach = _laid_together(image, offsets, curtains), curtains / 2
-    smooth = gaussian_filter1d(image, cutoff / 20, axis=0, mode="nearest")
-    strength = np.quantile(smooth.max(axis=1), 0.7)
-    # Within the canopy cover tells how well it was seen; its middle is that of its flanks.
-    excess = np.clip(smooth - BACKGROUND * strength, 0, (FULL - BACKGROUND) * strength)
-    return _centre(excess, offsets, reach, cutoff)
+    return _centre(np.ascontiguousarray(image), offsets, reach, cutoff)
 
 
 def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
@@ -77,21 +74,17 @@ def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
 
 
 @compiled
-def _centre(excess: Values, offsets: Values, reach: float, cutoff: float) -> Values:
+def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Values:
     """Smoothed centroids (n,) of canopy (n, m) within reach of them."""
-    n = len(excess)
-    centre, measured, weight, robust, sorted_ = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    n = len(image)
+    excess = _excess(blurred_down(image, cutoff / 20, CARRIED_ON))
+    measured, weight, robust, ranked = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    centre: Values = np.zeros(n)
     for _ in range(4):
-        for i in range(n):
-            amount, moment = 0.0, 0.0
-            for j in range(len(offsets)):
-                # A soft edge, so that a cell more or less doesn't move the centroid.
-                soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
-                amount += excess[i, j] * soft
-                moment += excess[i, j] * soft * offsets[j]
-            measured[i], weight[i], sorted_[i] = moment / max(amount, 1e-9), amount, amount
+        _centroids(excess, offsets, centre, reach, measured, weight)
+        ranked[:] = weight
         # Stations of a stray leaf or two tell nothing of the row's middle.
-        typical = max(quantile(sorted_, n, 0.7), 1e-9)
+        typical = max(quantile(ranked, n, 0.7), 1e-9)
         for i in range(n):
             weight[i] *= min(max(2 * weight[i] / typical - 0.5, 0.0), 1.0)
             robust[i] = 1.0
@@ -101,14 +94,42 @@ def _centre(excess: Values, offsets: Values, reach: float, cutoff: float) -> Val
             held = 0
             for i in range(n):
                 if weight[i] > 0:
-                    sorted_[held] = abs(measured[i] - centre[i])
+                    ranked[held] = abs(measured[i] - centre[i])
                     held += 1
-            scale = 1.5 * quantile(sorted_, held, 0.5) + 0.01 if held else 1.0
+            scale = 1.5 * quantile(ranked, held, 0.5) + 0.01 if held else 1.0
             for i in range(n):
                 robust[i] = 1 / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
         if np.abs(centre - before).max() < SETTLED:
             break
     return centre
+
+
+@compiled
+def _excess(image: Values) -> Values:
+    """Cover (n, m) above what isn't canopy, where its flanks tell its middle, and cover only how well it was seen."""
+    n, m = image.shape
+    ranked = np.zeros(n)
+    for i in range(n):
+        for j in range(m):
+            ranked[i] = max(ranked[i], image[i, j])
+    strength = quantile(ranked, n, 0.7)
+    for i in range(n):
+        for j in range(m):
+            image[i, j] = min(max(image[i, j] - BACKGROUND * strength, 0.0), (FULL - BACKGROUND) * strength)
+    return image
+
+
+@compiled
+def _centroids(excess: Values, offsets: Values, centre: Values, reach: float, measured: Values, weight: Values) -> None:
+    """Measure centroids (n,) of canopy (n, m) within reach of a centre (n,), and how much canopy tells them."""
+    for i in range(len(excess)):
+        amount, moment = 0.0, 0.0
+        for j in range(len(offsets)):
+            # A soft edge, so that a cell more or less doesn't move the centroid.
+            soft = min(max((reach - abs(offsets[j] - centre[i])) / 0.1 + 0.5, 0.0), 1.0)
+            amount += excess[i, j] * soft
+            moment += excess[i, j] * soft * offsets[j]
+        measured[i], weight[i] = moment / max(amount, 1e-9), amount
 
 
 def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:

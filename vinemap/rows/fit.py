@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import shapely
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import maximum_filter
 
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
+from vinemap.compute.filters import blurred
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, extend, normals, resample, smoothed, way_along
 from vinemap.geo.raster import Raster, cells_in, nearest_cell
@@ -289,11 +290,20 @@ def _noise_stretch(share: _Share) -> float:
 def _straighten(share: _Share, canopy: Values, shift: Values) -> tuple[Values, Values]:
     """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
     m = int(np.ceil(share.half / CELL))
-    leaves, everything = _spread(share.station, share.left, canopy, shift, m)
-    density = max(float(everything.mean()), 1e-9)
+    return _cover(share.station, share.left, canopy, shift, m), np.arange(-m, m + 1) * CELL
+
+
+@compiled
+def _cover(station: Values, left: Values, canopy: Values, shift: Values, m: int) -> Values:
+    """Share of canopy (stations, 2 m + 1) in cells, smoothed the wider the fewer points there are."""
+    leaves, everything = _spread(station, left, canopy, shift, m)
+    density = max(everything.sum() / everything.size, 1e-9)
     sigma = max(1.0, density**-0.5)
-    image = gaussian_filter(leaves, sigma) / (gaussian_filter(everything, sigma) + 0.1 * density)
-    return image, np.arange(-m, m + 1) * CELL
+    leaves, everything = blurred(leaves, sigma), blurred(everything, sigma)
+    for i in range(len(shift)):
+        for j in range(2 * m + 1):
+            leaves[i, j] /= everything[i, j] + 0.1 * density
+    return leaves
 
 
 @compiled

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-LEVEL = 6
+LEVEL = 4
 """Of compression."""
 
 
