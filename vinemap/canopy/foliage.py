@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.points import NO_SECTIONS, above_weeds, canopy_size
+from vinemap.canopy.points import NO_SECTIONS, canopy_floor, canopy_size
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -81,7 +81,8 @@ def separate_canopy(
         spacing = float(sections.spacing.max())
         top, half = canopy_size(sections.points[:, 0], sections.height, spacing, max_height)
         half_width = half if half_width is None else half_width
-        margin, min_height = min(margin, float(above_weeds(top))), min(min_height, UPPER * top)
+        floor = canopy_floor(sections.points[:, 0], sections.height, (top, half), spacing)
+        margin, min_height = min(margin, floor), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
     limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height, top)

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.canopy.points import above_weeds
+from vinemap.canopy.points import LOWLY, above_weeds
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -32,9 +32,9 @@ DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
 SPREADING = 2.5, 0.8
 """Ratios of width to depth of a canopy whose underside was hardly seen, and of one that hides little of it."""
-LOWLY, ON_WEEDS, HIDDEN = 1.3, 0.08, (0.45, 0.25)
-"""Metres below which a row is low, and within which of where it is told from weeds its foliage may go on below, and
-shares of its height up to there, where its numbers are to be doubted, and where they aren't."""
+ON_WEEDS, HIDDEN = 0.08, (0.45, 0.25)
+"""Metres above where low rows are told from weeds by their height within which foliage may go on below, and shares of
+a row's height up to its foot where its numbers are to be doubted, and where they aren't."""
 ODD_SIZE, ODD_DEVIATIONS = 1.4, 4.0
 """Ratio of a row's height or width to the median of its block, or its inverse, and deviations from it, that are odd."""
 FEW, NEARBY = 3, 3.0

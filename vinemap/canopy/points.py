@@ -26,12 +26,50 @@ UPPER, EDGE = 0.5, 0.1
 """Share of its height above which a canopy's width is told, and share of its density, from its middle, at its sides."""
 WIDER, BESIDE = 1.5, 0.2
 """By how much, and by how many metres, a canopy may be wider than it is on the whole."""
+LOWLY = 1.3
+"""Metres below which a row is low."""
+SOLID, RISE, CLEAR = 0.25, 1.5, 0.15
+"""Foliage that goes on at a height has this share, at the least, of the density above, on the mean; not so many times
+that of a height above it, as where another plant begins; and of its own this share, at the most, stands beside it."""
 
 
 def above_weeds(height: Values | float) -> Values:
     """Metres above ground from which canopies as high as (n,) are told from weeds."""
     out: Values = np.maximum(LOWEST, FOOT * (np.asarray(height) - LEAST))
     return out
+
+
+def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacing: float) -> float:
+    """Metres above ground from which a row's points are its canopy's.
+
+    That is where canopies are told from weeds by their height alone; lower, in low rows, as far as their foliage goes
+    on, and next to nothing stands beside it that could be weeds or the soil's noise.
+
+    Parameters
+    ----------
+    left, height : (n,) array
+        Points of a row: metres to its left, and above ground.
+    size : float, float
+        Height and half width of the row, as of :func:`canopy_size`.
+    spacing : float
+        Metres to the next row.
+    """
+    top, half = size
+    floor = float(above_weeds(top))
+    if top >= LOWLY:
+        return floor
+    inner = max((half - BESIDE) / WIDER, BIN)
+    strips = np.array([0.0, inner, WIDER * inner, half, max(half, 0.5 * spacing)])
+    density = _densities(left, height, strips, round(top / BIN))
+    inside, beside = density[0], density[2:].max(axis=0)
+    level = int(floor / BIN)
+    above = inside[level + 1 :]
+    if not above.any():
+        return floor
+    usual, least = above.mean(), above[: above.argmax() + 1].min()
+    while level > 0 and SOLID * usual <= inside[level] <= RISE * least and beside[level] <= CLEAR * inside[level]:
+        floor, least, level = min(floor, level * BIN), min(least, inside[level]), level - 1
+    return floor
 
 
 class Sections(NamedTuple):
@@ -165,3 +203,19 @@ def canopy_size(left: Values, height: Values, spacing: float, highest: float) ->
     while edge + 2 < len(across) and across[edge] + across[edge + 1] >= 2 * least:
         edge += 1
     return top, min(WIDER * edge * BIN + BESIDE, 0.5 * spacing)
+
+
+@compiled
+def _densities(left: Values, height: Values, strips: Values, levels: int) -> Values:
+    """Points (k, levels) per metre of width in strips between k + 1 distances from a row, by heights of ``BIN``."""
+    out = np.zeros((len(strips) - 1, levels))
+    for p in range(len(left)):
+        away, level = abs(left[p]), int(np.floor(height[p] / BIN))
+        if 0 <= level < levels and away < strips[-1]:
+            k = 0
+            while away >= strips[k + 1]:
+                k += 1
+            out[k, level] += 1
+    for k in range(len(out)):
+        out[k] /= max(strips[k + 1] - strips[k], 1e-9)
+    return out

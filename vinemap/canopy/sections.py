@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.canopy.points import Sections, canopy_size
+from vinemap.canopy.points import Sections, canopy_floor, canopy_size
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SOIL, SOIL_POINTS = 0.3, 200
-"""Metres from the terrain within which points are the soil's, and how many of them, about, a section needs: dense
-clouds have many more, which would tell no more of the inter-row's elevation."""
+"""Metres from the terrain within which points are the soil's, where no low canopy begins below, and how many of them,
+about, a section needs: dense clouds have many more, which would tell no more of the inter-row's elevation."""
 FOOT = 0.4
 """Share of a row's height from which points are taken for canopy, where that is less than is asked for."""
 
@@ -82,11 +82,12 @@ def cut_sections(
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
         top, half = canopy_size(left, height, float(spacing[row]), high)
-        canopy, soil = _count(left, height, half, min(low, FOOT * top), high)
+        below = min(SOIL, canopy_floor(left, height, (top, half), float(spacing[row])))
+        canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
         length = max(len(position) * step, step)
         a = max(width, min(max_width, min_points * length / max(canopy, 1)))
         every = max(1, int(soil * a / length / SOIL_POINTS))
-        n, index = _members(along, height, position, a / 2, every)
+        n, index = _members(along, height, position, a / 2, (below, every))
         start = np.concatenate([[0], np.cumsum(n)])
         here = at(curves[row], position)
         level = sample(dtm, here)
@@ -137,23 +138,25 @@ def _take(
 
 
 @compiled
-def _count(left: Values, height: Values, half: float, low: float, high: float) -> tuple[int, int]:
-    """Points (n,) of the canopy, so many metres to both sides, and of the soil."""
+def _count(left: Values, height: Values, half: float, levels: tuple[float, float, float]) -> tuple[int, int]:
+    """Points (n,) of the canopy, so many metres to both sides between two heights, and of the soil, below another."""
     canopy, soil = 0, 0
+    below, low, high = levels
     for p in range(len(left)):
         canopy += low <= height[p] <= high and abs(left[p]) < half
-        soil += abs(height[p]) < SOIL
+        soil += abs(height[p]) < below
     return canopy, soil
 
 
 @compiled
 def _members(
-    along: Values, height: Values, position: Values, reach: float, every: int
+    along: Values, height: Values, position: Values, reach: float, soil: tuple[float, int]
 ) -> tuple[Ints, NDArray[np.int32]]:
     """How many points (m,) lie within reach of each position along a row, and which, section after section.
 
-    Of the soil's one in so many: chosen by its place, so that the points' order doesn't matter.
+    Of the soil's, below a height, one in so many: chosen by its place, so that the points' order doesn't matter.
     """
+    below, every = soil
     m = len(position)
     n = np.zeros(m, dtype=np.int64)
     if m == 0:
@@ -162,7 +165,7 @@ def _members(
     table = np.searchsorted(position, position[0] + step * np.arange(int((position[-1] - position[0]) / step) + 2))
     first = np.empty(len(along), dtype=np.int32)
     for p in range(len(along)):
-        if abs(height[p]) < SOIL and int(1000 * along[p]) % every != 0:
+        if abs(height[p]) < below and int(1000 * along[p]) % every != 0:
             first[p] = m
             continue
         bin_ = int((along[p] - reach - position[0]) / step)
