@@ -31,6 +31,8 @@ LOWLY = 1.3
 SOLID, RISE, CLEAR = 0.25, 1.5, 0.15
 """Foliage that goes on at a height has this share, at the least, of the density above, on the mean; not so many times
 that of a height above it, as where another plant begins; and of its own this share, at the most, stands beside it."""
+SURE = 3.0
+"""Standard deviations of the number of points by which a rise is none of chance."""
 
 
 def above_weeds(height: Values | float) -> Values:
@@ -42,8 +44,9 @@ def above_weeds(height: Values | float) -> Values:
 def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacing: float) -> float:
     """Metres above ground from which a row's points are its canopy's.
 
-    That is where canopies are told from weeds by their height alone; lower, in low rows, as far as their foliage goes
-    on, and next to nothing stands beside it that could be weeds or the soil's noise.
+    That is where canopies are told from weeds by their height alone. In low rows it is lower, as far as their foliage
+    goes on and next to nothing stands beside it that could be weeds or the soil's noise; or higher, where foliage has
+    thinned out and something denser begins below.
 
     Parameters
     ----------
@@ -66,7 +69,11 @@ def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacin
     above = inside[level + 1 :]
     if not above.any():
         return floor
-    usual, least = above.mean(), above[: above.argmax() + 1].min()
+    upper = max(int(UPPER * top / BIN) - level - 1, 0)
+    lower = above[: upper + above[upper:].argmax() + 1]
+    usual, least = above.mean(), lower.min()
+    if inner * (inside[level] - RISE * least) > SURE * np.sqrt(inner * inside[level]):
+        return max(floor, (level + 1 + int((lower <= RISE * least).argmax())) * BIN)
     while level > 0 and SOLID * usual <= inside[level] <= RISE * least and beside[level] <= CLEAR * inside[level]:
         floor, least, level = min(floor, level * BIN), min(least, inside[level]), level - 1
     return floor
