@@ -14,7 +14,7 @@ from products import place_product
 
 from vinemap import paths
 from vinemap.product.pages import changes
-from vinemap.product.pages.page import page, repacked, unpacked
+from vinemap.product.pages.page import LEVEL, page, repacked, unpacked
 from vinemap.product.pages.survey import write_index
 from vinemap.product.recipe import product_in
 from vinemap.product.seasons.history import history
@@ -146,7 +146,7 @@ def test_what_is_packed_in_a_page_can_be_exchanged():
     assert (unpacked(other, "details"), unpacked(other, "more")) == ({"a": "</script>"}, 2)
     assert repacked(other, "details", b"[1]") == made
     assert repacked(made, "nothing", b"1") == made
-    assert unpacked(made.replace(base64.b64encode(zlib.compress(b"[1]", 6)).decode(), "???"), "details") is None
+    assert unpacked(made.replace(base64.b64encode(zlib.compress(b"[1]", LEVEL)).decode(), "???"), "details") is None
 
 
 def test_a_parcels_page_shows_its_earlier_flights(flights, tmp_path):

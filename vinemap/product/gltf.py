@@ -144,7 +144,7 @@ def write_glb(
 
     zero = np.asarray(origin, dtype=np.float64)
     placed = {"crs": crs, **(extras or {}), "origin": zero}
-    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=jsonable(placed))
+    root = gltf.Node(name="canopy", rotation=Z_UP_TO_Y_UP, extras=_known(jsonable(placed)))
     out = gltf.GLTF2(
         asset=gltf.Asset(version="2.0", generator=f"vinemap {vinemap.__version__}"),
         scene=0,
@@ -154,7 +154,7 @@ def write_glb(
     positions, indices = bytearray(), bytearray()
     stored: dict[bytes, int] = {}
     for mesh in meshes:
-        node = gltf.Node(name=mesh.label, extras=jsonable({"row_id": mesh.row_id, **mesh.extras}))
+        node = gltf.Node(name=mesh.label, extras=_known(jsonable({"row_id": mesh.row_id, **mesh.extras})))
         out.nodes.append(node)
         if len(mesh.faces) == 0:
             continue
@@ -230,7 +230,11 @@ def write_glb(
 
 def _properties(part: Any) -> dict[str, Any]:
     """Those of a part of a glTF document that are told."""
-    return {name: value for name, value in vars(part).items() if value is not None and value not in ({}, [])}
+    return {name: value for name, value in _known(vars(part)).items() if value not in ({}, [])}
+
+
+def _known(properties: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in properties.items() if value is not None}
 
 
 def _quantise(centred: Floats) -> tuple[NDArray[np.int16], float]:

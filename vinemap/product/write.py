@@ -51,16 +51,16 @@ def write_product(
         If one can't be written.
     """
     parcel, date = record["parcel"], datetime.fromisoformat(record["flown"])
-    layers = {name: conform(layer, name) for name, layer in layers.items()}
+    tables = {name: conform(layer, name) for name, layer in layers.items()}
 
     def canopies_and_page() -> list[str]:
         _write_meshes(folder, parcel, meshes, points, plain=plain, geoid=geoid)
         return write_page(folder, record, layers, rasters["dtm"], rasters["chm"])
 
     writers: list[Callable[[], list[str] | None]] = [
-        partial(write_geopackage, layers, paths.geopackage(folder, parcel), date=date),
+        partial(write_geopackage, tables, paths.geopackage(folder, parcel), date=date),
         canopies_and_page,
-        partial(_write_project, folder, parcel, layers, rasters, date=date, vertical=points.vertical),
+        partial(_write_project, folder, parcel, tables, rasters, date=date, vertical=points.vertical),
     ]
     return [remark for told in in_threads(lambda write: write(), writers) for remark in told or ()]
 
