@@ -141,9 +141,9 @@ def _coordinates(part: PointCloud, lookup: _Lookup, reach: Values) -> RowCoordin
 
 @compiled
 def _in_cells(bins: Bins, grid: Grid, nearest: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Points in the cells that touch those of a lookup (ny, nx) with a guide."""
+    """Points, in their order, in the cells that touch those of a lookup (ny, nx) with a guide."""
     start, member = bins.start, bins.member
-    marked = np.zeros(len(start) - 1, dtype=np.bool_)
+    marked, chosen = np.zeros(len(start) - 1, dtype=np.bool_), np.zeros(len(member), dtype=np.bool_)
     n = 0
     for i in range(grid.ny):
         for j in range(grid.nx):
@@ -156,13 +156,14 @@ def _in_cells(bins: Bins, grid: Grid, nearest: NDArray[np.int32]) -> NDArray[np.
                         if not marked[cell]:
                             marked[cell] = True
                             n += start[cell + 1] - start[cell]
+                            for k in range(start[cell], start[cell + 1]):
+                                chosen[member[k]] = True
     out = np.empty(n, dtype=np.int32)
     n = 0
-    for cell in range(len(marked)):
-        if marked[cell]:
-            for k in range(start[cell], start[cell + 1]):
-                out[n] = member[k]
-                n += 1
+    for p in range(len(chosen)):
+        if chosen[p]:
+            out[n] = p
+            n += 1
     return out
 
 
