@@ -138,7 +138,7 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     second[1] = 1.0
     weak = np.flatnonzero(first[2] < SURE)
     if len(weak):
-        second[:, weak] = _strongest(spectrum[weak], first[:2, weak], *how)
+        second[:, weak] = _strongest(spectrum[weak], np.ascontiguousarray(first[:2, weak]), *how)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
     waves = [(np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi), 1 / np.hypot(x, y), s) for y, x, s in (first, second)]
     return np.concatenate(waves)
