@@ -27,6 +27,7 @@ ROOMS = [
     "odometry",
     "export",
     "parcel",
+    "warm",
     "jobs",
     "cli",
     "__main__",

@@ -13,6 +13,7 @@ from vinemap.cli.run import run
 from vinemap.cli.survey import survey
 from vinemap.cli.terminal import hushed, plain_errors
 from vinemap.cli.track import track
+from vinemap.cli.warm import warm
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -21,7 +22,7 @@ def commands() -> None:
     """Vine rows and light canopy meshes from UAV point clouds."""
 
 
-for command in (run, survey, register, config, evaluate, export, track):
+for command in (run, survey, register, config, evaluate, export, track, warm):
     commands.add_command(command)
 
 

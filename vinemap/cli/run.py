@@ -57,6 +57,7 @@ def run(
         from vinemap.config.settings import Settings
         from vinemap.config.surveys import load_settings
         from vinemap.geo.crs import parse_crs
+        from vinemap.warm import ahead
 
     survey = paths.named_by(cloud_files(clouds))
     name = check_parcel(parcel) if parcel is not None else survey
@@ -73,7 +74,7 @@ def run(
         "origin": origin,
         "named": parcel is not None,
     }
-    with progress(name) as step:
+    with progress(name) as bar, ahead(bar) as step:
         with _importing():
             from vinemap.parcel import map_parcel
         summary = map_parcel(clouds, folder, parcel=name, step=step, **options)

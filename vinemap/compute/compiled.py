@@ -35,33 +35,49 @@ _one_at_a_time = threading.Lock()
 
 def compiled(function: F) -> F:
     """Compile a function at its first call, for threads without the GIL, and keep it for later processes."""
-    folder = _folder()
-    if folder is None:
+    where = folder()
+    if where is None:
         return cast("F", njit(nogil=True)(function))
     with _one_at_a_time:  # numba reads where to keep a function when that is decorated, from what all of it shares
-        elsewhere, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        elsewhere, config.CACHE_DIR = config.CACHE_DIR, str(where)
         try:
             return cast("F", njit(cache=True, nogil=True)(function))
         finally:
             config.CACHE_DIR = elsewhere
 
 
-@cache
-def _folder() -> Path | None:
+def folder() -> Path | None:
     """Folder of what these sources compile to; None where none can be written, and each process compiles anew."""
+    return _folder()[0]
+
+
+def is_new() -> bool:
+    """Whether this process made that folder, so that all is still to be compiled."""
+    return _folder()[1]
+
+
+def kept() -> set[str]:
+    """Files of what is kept there, one for each kind of numbers that a function was compiled for."""
+    where = folder()
+    return {path.name for path in where.glob("*/*.nbc")} if where else set()
+
+
+@cache
+def _folder() -> tuple[Path | None, bool]:
     name = PREFIX + _hash(PACKAGE)
     own = Path(config.CACHE_DIR) if config.CACHE_DIR else None  # NUMBA_CACHE_DIR
     for home in [own] if own else [PACKAGE / "__pycache__", platformdirs.user_cache_path("vinemap", appauthor=False)]:
-        folder = home / name
+        where = home / name
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
-            os.utime(folder)
+            new = not where.is_dir()
+            where.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=where).close()
+            os.utime(where)
         except OSError:
             continue
-        _sweep(home, folder)
-        return folder
-    return None
+        _sweep(home, where)
+        return where, new
+    return None, False
 
 
 def _hash(package: Path) -> str:

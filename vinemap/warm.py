@@ -1,0 +1,142 @@
+"""All that is compiled, compiled ahead of its first use, by mapping a made-up vineyard."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from vinemap.compute import compiled, machine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+ROWS, LENGTH, SPACING = 6, 24.0, 2.5
+"""Of the made-up vineyard: rows, and metres."""
+POINTS = 40_000
+BESIDE = [sys.executable, "-c", "from vinemap.warm import model_canopies_of_none as f; f()"]
+"""What runs in a process beside this one."""
+
+
+class Warmth(NamedTuple):
+    """What came of compiling ahead."""
+
+    folder: Path | None
+    """Where it is kept; None where nowhere."""
+    n: int
+    """Functions kept there, each as often as it is compiled for other kinds of numbers."""
+    new: int
+    """Those that weren't there before."""
+    seconds: float
+
+    def line(self) -> str:
+        """What people are told."""
+        if self.folder is None:
+            return "nothing can be kept: neither vinemap's own folder nor the user's cache can be written"
+        done = f"{self.new} of them compiled in {self.seconds:.1f} s" if self.new else "all compiled before"
+        return f"{self.n} functions kept in {self.folder}, {done}"
+
+
+def warm() -> Warmth:
+    """Compile what isn't kept yet: what finds rows here, what models canopies in a process beside it."""
+    began, folder = time.perf_counter(), compiled.folder()
+    before = compiled.kept()
+    if folder:
+        with _beside() as wait:
+            map_rows_of_none()
+            wait()
+        model_canopies_of_none()
+    return Warmth(folder, len(compiled.kept()), len(compiled.kept() - before), time.perf_counter() - began)
+
+
+@contextmanager
+def ahead(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
+    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits, at a stage, for what is compiled meanwhile.
+
+    Where something is kept already, all is taken to be.
+    """
+    if not compiled.is_new():
+        yield step
+        return
+    with _beside() as wait:
+
+        def waiting(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            if name == until:
+                wait()
+            return step(name, function, *args, **kwargs)
+
+        yield waiting
+
+
+@contextmanager
+def _beside() -> Iterator[Callable[[], object]]:
+    """Model canopies of none in a process, which goes with this; gives what waits for it. Without a core for it, none.
+
+    What it couldn't compile is compiled where it is needed, so that its failing is none of ours.
+    """
+    if machine.cores() < 2:
+        yield int
+        return
+    nobody: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    with subprocess.Popen(BESIDE, **nobody) as process:  # noqa: S603 - our own
+        try:
+            yield process.wait
+        finally:
+            process.kill()
+
+
+def map_rows_of_none() -> None:
+    """Find the rows of the made-up vineyard, from points that were clipped to a polygon."""
+    import shapely
+
+    from vinemap.cloud.points import PointCloud
+    from vinemap.geo.crs import parse_crs
+    from vinemap.geo.zones import deal, zones_of
+    from vinemap.parcel import map_rows
+
+    xyz = _points()
+    around = shapely.box(*xyz[:, :2].min(axis=0) - 1, *xyz[:, :2].max(axis=0) + 1)
+    map_rows(PointCloud(deal(xyz, zones_of([around]))[0], parse_crs("EPSG:32632")))
+
+
+def model_canopies_of_none() -> None:
+    """Model the canopies of the made-up vineyard along rows that are known."""
+    import geopandas as gpd
+    import numpy as np
+    import shapely
+
+    from vinemap.canopy.model import find_canopies, model_sections
+    from vinemap.cloud.points import PointCloud
+    from vinemap.config.settings import Settings
+    from vinemap.geo.crs import parse_crs
+    from vinemap.geo.raster import Raster, grid_over
+
+    xyz, crs = _points(), parse_crs("EPSG:32632")
+    grid = grid_over(xyz.min(axis=0), xyz.max(axis=0), resolution=0.5)
+    dtm = Raster(np.zeros(grid.shape), grid, crs)
+    lines = [shapely.LineString([(0, y, 0), (LENGTH, y, 0)]) for y in SPACING * np.arange(ROWS)]
+    rows = gpd.GeoDataFrame({"row_id": np.arange(ROWS), "spacing_m": SPACING}, geometry=lines, crs=crs)
+    gaps = gpd.GeoDataFrame({name: np.empty(0) for name in ("row_id", "start_m", "end_m")}, geometry=[], crs=crs)
+    cloud = PointCloud(xyz, crs).above(dtm)
+    model_sections(find_canopies(cloud, rows, gaps, dtm, Settings()), crs)
+
+
+@cache
+def _points() -> NDArray[np.float64]:
+    """Points (n, 3) of rows along the x axis on level ground: every other one is a leaf's, which are round bodies'."""
+    import numpy as np
+
+    draw = np.random.default_rng(0)
+    x, y = draw.uniform(0, LENGTH, POINTS), draw.uniform(-SPACING, ROWS * SPACING, POINTS)
+    z, leaf = draw.normal(0, 0.02, POINTS), np.arange(POINTS) % 2 == 0
+    angle, away = draw.uniform(0, 2 * np.pi, POINTS), np.sqrt(draw.uniform(0, 1, POINTS))
+    y[leaf] = (SPACING * draw.integers(0, ROWS, POINTS) + 0.3 * away * np.cos(angle))[leaf]
+    z[leaf] = (1.2 + 0.6 * away * np.sin(angle))[leaf]
+    return np.column_stack([x, y, z])
