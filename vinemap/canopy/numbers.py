@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import geopandas as gpd
@@ -11,6 +12,7 @@ import shapely
 
 from vinemap.canopy.points import LOWLY, above_weeds
 from vinemap.compute.compiled import compiled
+from vinemap.compute.order import select
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
@@ -175,28 +177,40 @@ def _seen(points: Values, heights: Values, start: Ints, middle: Values, bottom: 
     """Share (m,) of cells of height on both sides of sections' middles, from bottom to top, that have points."""
     out = np.zeros(len(middle))
     for k in range(len(middle)):
-        n = max(int(np.ceil((top[k] - bottom[k]) / CELL)), 1)
-        shown = np.zeros((2, n))
+        n = max(math.ceil((top[k] - bottom[k]) / CELL), 1)
+        shown, cells = np.zeros((2, n), dtype=np.bool_), 0
         for p in range(start[k], start[k + 1]):
             i = int((heights[p] - bottom[k]) / CELL)
             if 0 <= i < n and heights[p] >= bottom[k]:
-                shown[int(points[p, 0] > middle[k]), i] = 1
-        out[k] = shown.mean()
+                side = int(points[p, 0] > middle[k])
+                cells += not shown[side, i]
+                shown[side, i] = True
+        out[k] = cells / (2 * n)
     return out
 
 
 def quantile_of(values: Values, start: Ints, q: float) -> Values:
     """Quantile (m,) of the values (n,) of each section; 0 where it has none."""
-    out = np.zeros(len(start) - 1)
-    in_threads(lambda part: _quantiles(*part, np.ascontiguousarray(values), start, q, out), stretches(len(out)))
+    out, held = np.zeros(len(start) - 1), np.array(values, dtype=np.float64)
+    in_threads(lambda part: _quantiles(*part, held, start, q, out), stretches(len(out)))
     return out
 
 
 @compiled
 def _quantiles(first: int, last: int, values: Values, start: Ints, q: float, out: Values) -> None:
+    """Write quantiles between ranks, as numpy's; the values lose their order within sections."""
     for k in range(first, last):
-        if start[k + 1] > start[k]:
-            out[k] = np.quantile(values[start[k] : start[k + 1]], q)
+        n = start[k + 1] - start[k]
+        if n == 0:
+            continue
+        place = 1 + (n - 1) * q
+        rank = math.floor(place)
+        at, part = start[k] + rank - 1, place - rank
+        select(values, start[k], start[k + 1], at)
+        upper = values[min(at + 1, start[k + 1] - 1)]
+        for p in range(at + 2, start[k + 1]):
+            upper = min(upper, values[p])
+        out[k] = values[at] * (1 - part) + upper * part
 
 
 def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vinemap.compute.compiled import compiled
+from vinemap.compute.order import select
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.raster import cell_of
 
@@ -79,31 +81,6 @@ def _place(first: int, last: int, cell: Indices, place: Ints, index: Indices) ->
 
 
 @compiled
-def _select(values: Values, first: int, last: int, rank: int) -> None:
-    """Put the value of a rank where it belongs among those from first to last - 1, and none larger before it."""
-    low, high = first, last - 1
-    while low < high:
-        a, b, c = values[low], values[(low + high) // 2], values[high]
-        pivot = max(min(a, b), min(max(a, b), c))
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if rank <= j:
-            high = j
-        elif rank >= i:
-            low = i
-        else:
-            return
-
-
-@compiled
 def _quantiles(
     first: int,
     last: int,
@@ -117,25 +94,23 @@ def _quantiles(
     out: Values,
 ) -> None:
     ny, nx = shape
-    held = np.empty(64, dtype=values.dtype)
+    held = np.empty(64)
     for i in range(first, last):
         for j in range(n.shape[1]):
-            size = 0
+            # Cells beside each other in a row of the grid lie one after the other.
+            west, east = j * blocks, min((j + 1) * blocks, nx)
             for a in range(i * blocks, min((i + 1) * blocks, ny)):
-                # Cells beside each other in a row of the grid lie one after the other.
-                low, high = start[a * nx + j * blocks], start[a * nx + min((j + 1) * blocks, nx)]
-                if size + high - low > len(held):
-                    larger = np.empty(2 * (size + high - low), dtype=values.dtype)
-                    larger[:size] = held[:size]
-                    held = larger
-                for k in range(low, high):
+                n[i, j] += start[a * nx + east] - start[a * nx + west]
+            if n[i, j] > len(held):
+                held = np.empty(2 * n[i, j])
+            size, before = 0, int(np.int64(0))  # a plain 0 would have `select` compiled twice
+            for a in range(i * blocks, min((i + 1) * blocks, ny)):
+                for k in range(start[a * nx + west], start[a * nx + east]):
                     held[size] = values[index[k]]
                     size += 1
-            n[i, j] = size
             if size:
-                first_left = 0
                 for q in range(len(quantiles)):
-                    rank = max(int(np.ceil(quantiles[q] * size)) - 1, 0)
-                    _select(held, first_left, size, rank)
+                    rank = max(math.ceil(quantiles[q] * size) - 1, 0)
+                    select(held, before, n[i, j], rank)
                     out[q, i, j] = held[rank]
-                    first_left = rank
+                    before = rank

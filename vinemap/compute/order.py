@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
@@ -39,9 +41,9 @@ def select(values: Values, first: int, last: int, rank: int) -> float:
 @compiled
 def quantile(values: Values, n: int, q: float) -> float:
     """Quantile of the first n values, between two ranks a straight line, as numpy's; their order changes."""
-    at = q * (n - 1)
+    at, first = q * (n - 1), int(np.int64(0))  # a plain 0 would have `select` compiled twice
     rank = int(at)
-    lower = select(values, 0, n, rank)
+    lower = select(values, first, n, rank)
     if rank == n - 1:
         return lower
     upper = values[rank + 1]
