@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -173,9 +174,10 @@ def _nearest_guides(xy: Values, grid: Grid, reach: float) -> NDArray[np.int32]:
 
     It is near enough to the nearest of the cell's points: both project them on about the same tangent.
     """
-    nearest = np.full((grid.ny, grid.nx), -1, dtype=np.int32)
-    least = np.full((grid.ny, grid.nx), reach**2)
-    cells = int(np.ceil(reach / grid.resolution))
+    nearest, least = np.empty((grid.ny, grid.nx), dtype=np.int32), np.empty((grid.ny, grid.nx))
+    nearest.fill(-1)
+    least.fill(reach**2)
+    cells = math.ceil(reach / grid.resolution)
     for g in range(len(xy)):
         x, y = (xy[g, 0] - grid.west) / grid.resolution - 0.5, (grid.north - xy[g, 1]) / grid.resolution - 0.5
         for i in range(max(int(y) - cells, 0), min(int(y) + cells + 2, grid.ny)):
