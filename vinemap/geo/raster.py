@@ -192,9 +192,9 @@ def _block_sums(
 @compiled
 def _bounds(first: int, last: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.empty((2, points.shape[1]))
-    out[0], out[1] = np.inf, -np.inf
-    for p in range(first, last):
-        for k in range(points.shape[1]):
+    for k in range(points.shape[1]):
+        out[0, k], out[1, k] = np.inf, -np.inf
+        for p in range(first, last):
             out[0, k] = min(out[0, k], points[p, k])
             out[1, k] = max(out[1, k], points[p, k])
     return out
