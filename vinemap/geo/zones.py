@@ -112,8 +112,11 @@ def _gather(xyz: Floats, label: Labels, again: Ints, into: Labels, k: int) -> tu
             start[zone + 1] += 1
     for zone in into:
         start[zone + 1] += 1
-    start = np.cumsum(start)
-    out, place = np.empty((start[-1], 3)), start[:-1].copy()
+    place = np.empty(k, dtype=np.int64)
+    for zone in range(k):
+        place[zone] = start[zone]
+        start[zone + 1] += start[zone]
+    out = np.empty((start[k], 3))
     q = 0
     for p in range(len(label)):
         if label[p] >= 0:
