@@ -18,8 +18,6 @@ from vinemap.geo.raster import cell_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
@@ -132,13 +130,14 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     mean = np.einsum("kij,ij->k", windows, taper) / taper.sum()
     rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2)
     spectrum = fft(rows, n=wide, axis=1)
+    power = spectrum.real**2 + spectrum.imag**2
     how = COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING
-    first = np.stack(_strongest(spectrum, np.zeros((2, len(spectrum))), *how))
+    first = np.stack(_strongest(power, np.zeros((2, len(power))), *how))
     second = np.zeros_like(first)
     second[1] = 1.0
     weak = np.flatnonzero(first[2] < SURE)
     if len(weak):
-        second[:, weak] = _strongest(spectrum[weak], np.ascontiguousarray(first[:2, weak]), *how)
+        second[:, weak] = _strongest(power[weak], np.ascontiguousarray(first[:2, weak]), *how)
     # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
     waves = [(np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi), 1 / np.hypot(x, y), s) for y, x, s in (first, second)]
     return np.concatenate(waves)
@@ -146,7 +145,7 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
 
 @compiled
 def _strongest(
-    spectrum: NDArray[np.complex64],
+    powers: Values,
     other: Values,
     cell: float,
     shortest: float,
@@ -154,20 +153,20 @@ def _strongest(
     harmonics: int,
     reach: int,
 ) -> tuple[Values, Values, Values]:
-    """Frequency of the strongest wave (y and x, cycles a metre) of spectra (k, n, n/2 + 1), and its strength 0–1.
+    """Frequency of the strongest wave (y and x, cycles a metre) of powers (k, n, n/2 + 1), and its strength 0–1.
 
     It lies 30° at the least from another (2, k), if that isn't zero.
 
     The strength is the share of the power beyond long waves that the main lobes (``reach`` bins wide) about the
     wave and its harmonics hold.
     """
-    windows, n, _ = spectrum.shape
+    windows, n, _ = powers.shape
     half = n // 2
     unit = n * cell
     lowest, highest, long = (unit / longest) ** 2, (unit / shortest) ** 2, (unit / longest / 1.5) ** 2
     y, x, strength = np.empty(windows), np.empty(windows), np.empty(windows)
     for k in range(windows):
-        power = spectrum[k].real ** 2 + spectrum[k].imag ** 2
+        power = powers[k]
         total, most = 0.0, -1.0
         best_i, best_j = 0, 0
         for row in range(n):
