@@ -139,36 +139,35 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 
     course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
     wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
     """
-    return _whittaker(np.asarray(values, dtype=float), np.asarray(weights, dtype=float), cutoff, slope, ridge)
+    data, weight = (np.ascontiguousarray(v, dtype=float) for v in (values, weights))
+    if len(data) < 3:
+        return data.copy()
+    bands = _penalties(weight, float(cutoff), float(slope), max(float(ridge), 1e-9))
+    out: Values = _solve(bands, weight * data)
+    return out
 
 
-@compiled
 def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
     """Values (n,) as their trend and a detail.
 
     Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
     """
-    trend = _whittaker(values, weights, TREND * cutoff, 0.0, 0.0)
-    return trend + _whittaker(values - trend, weights, cutoff, SLOPE * cutoff, DETAIL)
+    trend = whittaker(values, weights, cutoff=TREND * cutoff)
+    return trend + whittaker(values - trend, weights, cutoff=cutoff, slope=SLOPE * cutoff, ridge=DETAIL)
 
 
 @compiled
-def _whittaker(values: Values, weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
-    if len(values) < 3:
-        return values.copy()
-    bands = _penalties(weights, (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2, max(ridge, 1e-9))
-    return _solve(bands, weights * values)
-
-
-@compiled
-def _penalties(weights: Values, second: float, first: float, ridge: float) -> Values:
+def _penalties(weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
     """Diagonal and both bands (n, 3) of what minimises Σ w (x − v)² + penalties on Δ²x, Δx, and x in gaps."""
-    n = len(weights)
-    level = weights.mean()
-    if level == 0:
-        level = 1.0
-    held = np.flatnonzero(weights >= 0.1 * level)
-    gap_first, gap_last = (held[0], held[-1]) if len(held) else (n, -1)
+    n, second, first = len(weights), (cutoff / (2 * np.pi)) ** 4, (slope / (2 * np.pi)) ** 2
+    level = 0.0
+    for weight in weights:
+        level += weight
+    level = level / n if level != 0 else 1.0
+    gap_first, gap_last = n, -1
+    for i in range(n):
+        if weights[i] >= 0.1 * level:
+            gap_first, gap_last = min(gap_first, i), i
     bands = np.zeros((n, 3))
     for i in range(n):
         left, inner, right = i > 1, 0 < i < n - 1, i < n - 2
