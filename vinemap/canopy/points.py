@@ -197,16 +197,23 @@ def canopy_size(left: Values, height: Values, spacing: float, highest: float) ->
     for p in range(len(left)):
         if LEAST <= height[p] <= highest and abs(left[p]) <= 0.25 * spacing:
             levels[int(height[p] / BIN)] += 1
-    total = np.cumsum(levels)
-    if total[-1] == 0:
+    total = levels.sum()
+    if total == 0:
         return highest, 0.5 * spacing
-    top = BIN * (np.searchsorted(total, TOP * total[-1]) + 1)
+    bins, below = 1, levels[0]
+    while below < TOP * total:
+        below += levels[bins]
+        bins += 1
+    top = BIN * bins
     across = np.zeros(int(0.5 * spacing / BIN) + 3)
     for p in range(len(left)):
         if UPPER * top <= height[p] <= highest and abs(left[p]) < 0.5 * spacing:
             across[int(abs(left[p]) / BIN)] += 1
-    least = EDGE * across.max()
-    edge = int(np.argmax(across))
+    edge = 0
+    for i in range(len(across)):
+        if across[i] > across[edge]:
+            edge = i
+    least = EDGE * across[edge]
     while edge + 2 < len(across) and across[edge] + across[edge + 1] >= 2 * least:
         edge += 1
     return top, min(WIDER * edge * BIN + BESIDE, 0.5 * spacing)
