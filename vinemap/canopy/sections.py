@@ -81,8 +81,9 @@ def cut_sections(
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
-        top, half = canopy_size(left, height, float(spacing[row]), high)
-        below = min(SOIL, canopy_floor(left, height, (top, half), float(spacing[row])))
+        across = left.astype(float)
+        top, half = canopy_size(across, height, float(spacing[row]), high)
+        below = min(SOIL, canopy_floor(across, height, (top, half), float(spacing[row])))
         canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
         length = max(len(position) * step, step)
         a = max(width, min(max_width, min_points * length / max(canopy, 1)))
@@ -148,7 +149,6 @@ def _count(left: Values, height: Values, half: float, levels: tuple[float, float
     return canopy, soil
 
 
-@compiled
 def _members(
     along: Values, height: Values, position: Values, reach: float, soil: tuple[float, int]
 ) -> tuple[Ints, NDArray[np.int32]]:
@@ -156,13 +156,30 @@ def _members(
 
     Of the soil's, below a height, one in so many: chosen by its place, so that the points' order doesn't matter.
     """
-    below, every = soil
     m = len(position)
     n = np.zeros(m, dtype=np.int64)
     if m == 0:
         return n, np.empty(0, dtype=np.int32)
     step = (position[-1] - position[0]) / m + reach
     table = np.searchsorted(position, position[0] + step * np.arange(int((position[-1] - position[0]) / step) + 2))
+    out = _list_members(along, height, position, reach, soil, table, step, n)
+    return n, out
+
+
+@compiled
+def _list_members(
+    along: Values,
+    height: Values,
+    position: Values,
+    reach: float,
+    soil: tuple[float, int],
+    table: Ints,
+    step: float,
+    n: Ints,
+) -> NDArray[np.int32]:
+    """Count the points of each position, and list them; ``table`` tells of equal steps which position follows."""
+    below, every = soil
+    m = len(position)
     first = np.empty(len(along), dtype=np.int32)
     for p in range(len(along)):
         if abs(height[p]) < below and int(1000 * along[p]) % every != 0:
@@ -176,15 +193,18 @@ def _members(
         while k < m and position[k] <= along[p] + reach:
             n[k] += 1
             k += 1
-    place = np.cumsum(n) - n
-    out = np.empty(n.sum(), dtype=np.int32)
+    place, total = np.empty(m, dtype=np.int64), 0
+    for k in range(m):
+        place[k] = total
+        total += n[k]
+    out = np.empty(total, dtype=np.int32)
     for p in range(len(along)):
         k = first[p]
         while k < m and position[k] <= along[p] + reach:
             out[place[k]] = p
             place[k] += 1
             k += 1
-    return n, out
+    return out
 
 
 @compiled
