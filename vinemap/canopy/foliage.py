@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 BIN = 0.05
 """Metres: bins δs of the histograms of Eq. 8–9."""
+LEVELS = round(3 / BIN)
+"""Bins of elevations, from 1.5 m below a section's soil to as much above it."""
 NOISE_CELL = 0.1
 """Metres: cells of a section in which a point has neighbours or is noise."""
 USUAL_CELLS = 100
@@ -79,7 +81,7 @@ def separate_canopy(
     m, top = len(sections.row_id), max_height
     if m:
         spacing = float(sections.spacing.max())
-        top, half = canopy_size(sections.points[:, 0], sections.height, spacing, max_height)
+        top, half = canopy_size(sections.points[:, 0].copy(), sections.height, spacing, max_height)
         half_width = half if half_width is None else half_width
         floor = canopy_floor(sections.points[:, 0], sections.height, (top, half), spacing)
         margin, min_height = min(margin, floor), min(min_height, UPPER * top)
@@ -142,7 +144,7 @@ def _separate(
         for side in range(2):
             sign = 1 - 2 * side
             w, h, distance = _plane(y, z, up, kept, sign, half_width)
-            walls[k, side] = w, h
+            walls[k, side, 0], walls[k, side, 1] = w, h
             slope = h / max(distance, 0.2)
             for p in range(len(y)):
                 if (y[p] >= 0) == (side == 0):
@@ -171,7 +173,7 @@ def _plane(y: Values, z: Values, up: Values, canopy: Flags, sign: int, widest: f
 
     The elevation is that of the inter-row's middle: the plane through it must not be steeper than the ground.
     """
-    walls, levels = np.zeros(int(widest / BIN) + 1), np.zeros(round(3 / BIN))
+    walls, levels = np.zeros(int(widest / BIN) + 1), np.zeros(LEVELS)
     total, leaves = 0.0, 0
     for p in range(len(y)):
         if canopy[p]:
@@ -215,11 +217,14 @@ def _drop_noise(y: Values, z: Values, kept: Flags, share: float) -> None:
             west, east = min(west, y[p]), max(east, y[p])
     if n == 0:
         return
+    used = 0
     cells = np.zeros((int((east - west) / NOISE_CELL) + 3, int((high - low) / NOISE_CELL) + 3))
     for p in range(len(y)):
         if kept[p]:
-            cells[int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1] += 1
-    least = max(3.0, share * n * min(1.0, USUAL_CELLS / np.count_nonzero(cells)))
+            i, j = int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1
+            used += cells[i, j] == 0
+            cells[i, j] += 1
+    least = max(3.0, share * n * min(1.0, USUAL_CELLS / used))
     for p in range(len(y)):
         if kept[p]:
             i, j = int((y[p] - west) / NOISE_CELL) + 1, int((z[p] - low) / NOISE_CELL) + 1
