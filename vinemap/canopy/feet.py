@@ -38,7 +38,7 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     if m == 0:
         return canopy, np.empty((0, 3, 2))
     near = _window(canopy, pool)
-    levels = _pooled(_histograms(canopy.points[:, 1], canopy.start, 0.0, FOOT_BIN, round(3 / FOOT_BIN)), near)
+    levels = _pooled(_histograms(canopy.points[:, 1].copy(), canopy.start, 0.0, FOOT_BIN, round(3 / FOOT_BIN)), near)
     low, high = (_rank(levels, q) * FOOT_BIN for q in FOOT_RANKS)
     foot = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
@@ -71,8 +71,8 @@ def _histograms(values: Values, start: Ints, low: float, width: float, bins: int
     """Histograms (m, bins) of each section's values; what lies beyond counts in the outer bins."""
     out = np.zeros((len(start) - 1, bins))
     for k in range(len(start) - 1):
-        for value in values[start[k] : start[k + 1]]:
-            out[k, min(max(int((value - low) / width), 0), bins - 1)] += 1
+        for p in range(start[k], start[k + 1]):
+            out[k, min(max(int((values[p] - low) / width), 0), bins - 1)] += 1
     return out
 
 
@@ -80,10 +80,14 @@ def _histograms(values: Values, start: Ints, low: float, width: float, bins: int
 def _rank(histograms: Values, q: float) -> Values:
     """Quantile (m,) of histograms (m, bins), in bins."""
     out = np.zeros(len(histograms))
-    for k in range(len(histograms)):
-        total = np.cumsum(histograms[k])
-        wanted = q * total[-1]
-        i = np.searchsorted(total, wanted)
-        before = total[i - 1] if i > 0 else 0.0
-        out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total[-1] else 0.5 * len(total)
+    m, bins = histograms.shape
+    for k in range(m):
+        total, before, i = 0.0, 0.0, 0
+        for j in range(bins):
+            total += histograms[k, j]
+        wanted = q * total
+        while before + histograms[k, i] < wanted:
+            before += histograms[k, i]
+            i += 1
+        out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total else 0.5 * bins
     return out
