@@ -64,7 +64,9 @@ def _grow_all(
     for k in range(first, last):
         n = start[k + 1] - start[k]
         body = np.empty(n + 2, dtype=np.complex128)
-        body[:n], body[n], body[n + 1] = points[start[k] : start[k + 1]], feet[k, 1], feet[k, 2]
+        for i in range(n):  # as a slice it would take a second to compile
+            body[i] = points[start[k] + i]
+        body[n], body[n + 1] = feet[k, 1], feet[k, 2]
         body = body[order_of(body)]
         ring = body[ring_of(body)]
         at = size = 2 * (start[k] + 2 * k)
@@ -72,7 +74,8 @@ def _grow_all(
             one, two = _outward(ring[i - 1], ring[i]), _outward(ring[i], ring[(i + 1) % len(ring)])
             turn = one.real * two.real + one.imag * two.imag
             if turn >= BLUNT:
-                out[size] = ring[i] + reach[k] * (one + two) / (1 + turn)
+                y, z = reach[k] * (one.real + two.real), reach[k] * (one.imag + two.imag)
+                out[size] = ring[i] + complex(y / (1 + turn), z / (1 + turn))
                 size += 1
             else:
                 out[size], out[size + 1] = ring[i] + reach[k] * one, ring[i] + reach[k] * two
@@ -84,7 +87,8 @@ def _grow_all(
 def _outward(a: complex, b: complex) -> complex:
     """Unit normal to the right of a → b, 0 where they coincide."""
     edge = b - a
-    return -1j * edge / abs(edge) if edge != 0 else 0j
+    length = abs(edge)
+    return complex(edge.imag / length, -edge.real / length) if length != 0 else 0j
 
 
 def foliage_reach(canopy: Sections, area: Values, perimeter: Values, vertices: Ints) -> Values:
