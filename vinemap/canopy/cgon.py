@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.hull import area_of, as_complex, as_pairs, checked_start, cross, order_of, ring_of, shared_area
-from vinemap.canopy.peeling import peel_section
+from vinemap.canopy.hull import area_of, as_complex, as_pairs, cross, order_of, ring_of, shared_area
+from vinemap.canopy.peeling import peel_sections
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -80,18 +80,16 @@ def enclose(
     -----
     Algorithm 1 and Eq. 12-19 of the thesis; the bilinear programme's optimum is found exactly, by choosing edges.
     """
-    section, fixed = as_complex(points), as_complex(feet).reshape(-1, 3)
-    offsets = checked_start(start, len(section), share)
     if c < 5:
         raise ValueError(f"c is {c}: a c-gon with three fixed vertices needs c >= 5")
-    if len(offsets) != len(fixed) + 1:
-        raise ValueError(f"start must climb from 0 to {len(section)} in {len(fixed) + 1} numbers")
+    peeled, fixed = peel_sections(points, start, share=share), as_complex(feet).reshape(-1, 3)
     m = len(fixed)
-    polygon, kept, areas = np.full((m, c), complex(math.nan, math.nan)), np.isfinite(section), np.full((3, m), math.nan)
-    in_threads(
-        lambda part: _enclose_all(*part, section, offsets, fixed, share, slide, polygon, kept, areas), stretches(m)
-    )
-    return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), kept, *areas)
+    if len(peeled.area) != m:
+        raise ValueError(f"start must climb from 0 to {len(peeled.kept)} in {m + 1} numbers")
+    hulls, polygon = as_complex(peeled.hull), np.full((m, c), complex(math.nan, math.nan))
+    areas = np.full((3, m), math.nan)
+    in_threads(lambda part: _enclose_all(*part, hulls, peeled.start, fixed, slide, polygon, areas), stretches(m))
+    return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), peeled.kept, *areas)
 
 
 @compiled
@@ -120,8 +118,11 @@ def _place(ring: Complex, foot: complex, side: float, extent: float) -> tuple[in
 
 
 @compiled
-def _outline(rest: Complex, right: complex, left: complex) -> Complex:
-    """Vertices (n + 1,) of the hull of a convex polygon and both feet, from the right foot round to the left one."""
+def _around(rest: Complex, right: complex, left: complex) -> Complex:
+    """Vertices (n + 1,) of the hull of a convex polygon and both feet, from the right foot round to the left one.
+
+    Of more than ``LONGEST`` they are simplified.
+    """
     corners = np.empty(len(rest) + 2, dtype=np.complex128)
     corners[0], corners[1] = right, left
     for k in range(len(rest)):
@@ -146,7 +147,7 @@ def _outline(rest: Complex, right: complex, left: complex) -> Complex:
             out[size] = q
             size += 1
     out[size] = left
-    return out[: size + 1]
+    return out[: size + 1] if size < LONGEST else _simplify(out[: size + 1])
 
 
 @compiled
@@ -196,11 +197,14 @@ def _choose(q: Complex, c: int) -> Complex:
     All are flush but at most one; no vertices where no choice closes the polygon. State of the dynamic programme:
     whether the one not flush is spent, edges used so far, the last of them.
     """
+    if len(q) < c:
+        return _split(q, c)
     n, edges = len(q) - 1, c - 2
     swept = np.zeros(n + 1)
     for k in range(2, n + 1):
         swept[k] = swept[k - 1] + cross(q[0], q[k - 1], q[k])
-    cost, origin = np.full((2, edges, n), math.inf), np.zeros((2, edges, n), dtype=np.int64)
+    cost, origin = np.empty((2, edges, n)), np.zeros((2, edges, n), dtype=np.int64)
+    cost.fill(math.inf)
     cost[0, 0, 0] = 0
     for j in range(1, n):
         for i in range(j):
@@ -238,7 +242,7 @@ def _trace(q: Complex, origin: Ints, spent: int) -> Complex:
 @compiled
 def _simplify(q: Complex) -> Complex:
     """A circumscribed outline of fewer edges (see LONGEST), first and last edge kept."""
-    n, size, last = len(q) - 1, 1, 0
+    n, size, last = len(q) - 1, 1, int(np.int64(0))  # a plain 0 would have `_corner` compiled twice
     out = np.empty_like(q)
     out[0] = q[0]
     for j in range(1, n):
@@ -264,48 +268,46 @@ def _split(q: Complex, c: int) -> Complex:
                 at = k
         for k in range(size, at, -1):
             out[k] = out[k - 1]
-        out[at] = (out[at - 1] + out[at + 1]) / 2
+        out[at] = 0.5 * (out[at - 1] + out[at + 1])
     return out[1:-1]
 
 
 @compiled
-def _polygon(rest: Complex, bottom: complex, right: complex, left: complex, out: Complex) -> None:
+def _polygon(ring: Complex, bottom: complex, right: complex, left: complex, slide: bool, out: Complex) -> None:
     """Write the c-gon around a convex polygon to ``out`` (c,)."""
+    c = len(out)
+    if slide and _holds(ring, bottom):  # v2 and vc lie on the line of the edge that holds v1
+        free = _choose(_around(ring, bottom, bottom), c + 2)
+        if len(free) > 0:
+            out[0] = bottom
+            for k in range(c - 1):  # as a slice it would take a second to compile
+                out[k + 1] = free[k]
+            return
     if right.real < left.real:
         right, left = left, right
-    q = _outline(rest, right, left)
-    if len(q) > LONGEST:
-        q = _simplify(q)
-    c = len(out)
-    free = _split(q, c) if len(q) < c else _choose(q, c)
+    q = _around(ring, right, left)
+    free = _choose(q, c)
     while len(free) == 0:  # it turns too far for so few edges: the feet stand on the underside, and move to its ends
         q = q[1:-1]
-        free = _split(q, c) if len(q) < c else _choose(q, c)
+        free = _choose(q, c)
     out[0], out[1], out[c - 1] = bottom, q[0], q[-1]
     for k in range(c - 3):
         out[k + 2] = free[k]
     if cross(q[-1], q[0], bottom) > 0:
         for k in range(1, len(q)):
             if cross(q[k - 1], q[k], bottom) < 0:
-                out[0] = (q[0] + q[-1]) / 2
+                out[0] = 0.5 * (q[0] + q[-1])
 
 
 @compiled
-def _slide(rest: Complex, bottom: complex, out: Complex) -> bool:
-    """Write the c-gon whose v2 and vc lie on the line of the edge of ``rest`` that holds v1; whether one does."""
-    c, extent = len(out), 0.0
-    for corner in rest:
+def _holds(ring: Complex, bottom: complex) -> bool:
+    """Whether an edge of a polygon's underside holds a point."""
+    extent = 0.0
+    for corner in ring:
         extent = max(extent, abs(corner - bottom))
-    for k in range(len(rest)):
-        a, b = rest[k - 1], rest[k]
+    for k in range(len(ring)):
+        a, b = ring[k - 1], ring[k]
         if a.real < bottom.real < b.real and abs(cross(a, b, bottom)) <= FLAT * extent * abs(b - a):
-            q = _outline(rest, bottom, bottom)
-            if len(q) > LONGEST:
-                q = _simplify(q)
-            free = _split(q, c + 2) if len(q) < c + 2 else _choose(q, c + 2)
-            if len(free) == 0:
-                return False
-            out[0], out[1:] = bottom, free
             return True
     return False
 
@@ -314,22 +316,18 @@ def _slide(rest: Complex, bottom: complex, out: Complex) -> bool:
 def _enclose_all(
     first: int,
     last: int,
-    points: Complex,
+    hulls: Complex,
     start: Ints,
     feet: Complex,
-    share: float,
     slide: bool,
     polygon: Complex,
-    kept: Flags,
     areas: Floats,
 ) -> None:
     """Write c-gons (m, c), and the areas (3, m) of the hull, of the c-gon, and of what they share."""
     for k in range(first, last):
-        mine = slice(start[k], start[k + 1])
-        if kept[mine].sum() >= 3 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
-            ring = peel_section(points[mine], kept[mine], share)
-            if not (slide and _slide(ring, feet[k, 0], polygon[k])):
-                _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], polygon[k])
+        ring = hulls[start[k] : start[k + 1]]
+        if len(ring) > 0 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
+            _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], slide, polygon[k])
             areas[0, k], areas[1, k], areas[2, k] = area_of(ring), area_of(polygon[k]), shared_area(polygon[k], ring)
 
 

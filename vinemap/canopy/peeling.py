@@ -90,7 +90,7 @@ def _expose(p: Complex, inner: Flags, ring: Ints, u: int, chain: Ints) -> tuple[
     if u + 1 < len(p) and inner[u + 1] and p[u + 1] == p[u]:
         chain[1], chain[2] = u + 1, b
         return 3, 0.0
-    size = 1
+    size = int(np.int64(1))  # a plain 1 would have `_walk` compiled twice
     if (a < u) != (u < b):  # u is the leftmost or rightmost: the chain turns at the one that takes its place
         step = 1 if u < a else -1
         end = u + step
@@ -152,19 +152,6 @@ def _peel(p: Complex, index: Ints, count: int) -> tuple[Ints, Ints]:
 
 
 @compiled
-def peel_section(points: Complex, kept: Flags, share: float) -> Complex:
-    """The convex hull of a section's kept points, once the outliers among them are no longer kept."""
-    here = np.flatnonzero(kept)
-    p = points[here]
-    order = order_of(p)
-    p = p[order]
-    removed, ring = _peel(p, order, math.ceil(share * len(p) - 1e-9))
-    for i in removed:
-        kept[here[order[i]]] = False
-    return p[ring]
-
-
-@compiled
 def _peel_all(
     first: int,
     last: int,
@@ -177,11 +164,24 @@ def _peel_all(
     hulls: Complex,
     size: Ints,
 ) -> None:
+    """Peel sections, and write of their hulls the areas, perimeters, vertices and numbers of them."""
     for k in range(first, last):
-        mine = slice(start[k], start[k + 1])
-        if kept[mine].sum() >= 3:
-            ring = peel_section(points[mine], kept[mine], share)
-            area[k], size[k], perimeter[k] = area_of(ring), len(ring), 0.0
-            for i in range(len(ring)):
-                hulls[start[k] + i] = ring[i]
-                perimeter[k] += abs(ring[i] - ring[i - 1])
+        here, n = np.empty(start[k + 1] - start[k], dtype=np.int64), 0
+        for i in range(start[k], start[k + 1]):
+            if kept[i]:
+                here[n] = i
+                n += 1
+        if n < 3:
+            continue
+        p = points[here[:n]]
+        order = order_of(p)
+        p = p[order]
+        removed, ring = _peel(p, order, math.ceil(share * n - 1e-9))
+        for i in removed:
+            kept[here[order[i]]] = False
+        for i in range(len(ring)):
+            hulls[start[k] + i] = p[ring[i]]
+        hull = hulls[start[k] : start[k] + len(ring)]
+        area[k], size[k], perimeter[k] = area_of(hull), len(ring), 0.0
+        for i in range(len(ring)):
+            perimeter[k] += abs(hull[i] - hull[i - 1])
