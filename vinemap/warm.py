@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.compute import compiled, machine
@@ -45,19 +44,19 @@ class Warmth(NamedTuple):
 
 
 def warm() -> Warmth:
-    """Compile what isn't kept yet: what finds rows here, what models canopies in a process beside it."""
+    """Compile what isn't kept yet: what models canopies in a process beside this one, all else in this one."""
     began, folder = time.perf_counter(), compiled.folder()
     before = compiled.kept()
     if folder:
         with _beside() as wait:
-            map_rows_of_none()
+            find_canopies_of_none()
             wait()
         model_canopies_of_none()
     return Warmth(folder, len(compiled.kept()), len(compiled.kept() - before), time.perf_counter() - began)
 
 
 @contextmanager
-def ahead(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
+def ahead(step: Callable[..., Any], *, until: str = "Canopy") -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits, at a stage, for what is compiled meanwhile.
 
     Where something is kept already, all is taken to be.
@@ -92,51 +91,50 @@ def _beside() -> Iterator[Callable[[], object]]:
             process.kill()
 
 
-def map_rows_of_none() -> None:
-    """Find the rows of the made-up vineyard, from points that were clipped to a polygon."""
+def find_canopies_of_none() -> None:
+    """Find rows of the made-up vineyard, from points that are clipped to a polygon, and what is canopy along them."""
+    import numpy as np
     import shapely
 
+    from vinemap.canopy.model import find_canopies
     from vinemap.cloud.points import PointCloud
+    from vinemap.config.settings import Settings
     from vinemap.geo.crs import parse_crs
     from vinemap.geo.zones import deal, zones_of
     from vinemap.parcel import map_rows
 
-    xyz = _points()
-    around = shapely.box(*xyz[:, :2].min(axis=0) - 1, *xyz[:, :2].max(axis=0) + 1)
-    map_rows(PointCloud(deal(xyz, zones_of([around]))[0], parse_crs("EPSG:32632")))
-
-
-def model_canopies_of_none() -> None:
-    """Model the canopies of the made-up vineyard along rows that are known."""
-    import geopandas as gpd
-    import numpy as np
-    import shapely
-
-    from vinemap.canopy.model import find_canopies, model_sections
-    from vinemap.cloud.points import PointCloud
-    from vinemap.config.settings import Settings
-    from vinemap.geo.crs import parse_crs
-    from vinemap.geo.raster import Raster, grid_over
-
-    xyz, crs = _points(), parse_crs("EPSG:32632")
-    grid = grid_over(xyz.min(axis=0), xyz.max(axis=0), resolution=0.5)
-    dtm = Raster(np.zeros(grid.shape), grid, crs)
-    lines = [shapely.LineString([(0, y, 0), (LENGTH, y, 0)]) for y in SPACING * np.arange(ROWS)]
-    rows = gpd.GeoDataFrame({"row_id": np.arange(ROWS), "spacing_m": SPACING}, geometry=lines, crs=crs)
-    gaps = gpd.GeoDataFrame({name: np.empty(0) for name in ("row_id", "start_m", "end_m")}, geometry=[], crs=crs)
-    cloud = PointCloud(xyz, crs).above(dtm)
-    model_sections(find_canopies(cloud, rows, gaps, dtm, Settings()), crs)
-
-
-@cache
-def _points() -> NDArray[np.float64]:
-    """Points (n, 3) of rows along the x axis on level ground: every other one is a leaf's, which are round bodies'."""
-    import numpy as np
-
     draw = np.random.default_rng(0)
     x, y = draw.uniform(0, LENGTH, POINTS), draw.uniform(-SPACING, ROWS * SPACING, POINTS)
     z, leaf = draw.normal(0, 0.02, POINTS), np.arange(POINTS) % 2 == 0
-    angle, away = draw.uniform(0, 2 * np.pi, POINTS), np.sqrt(draw.uniform(0, 1, POINTS))
-    y[leaf] = (SPACING * draw.integers(0, ROWS, POINTS) + 0.3 * away * np.cos(angle))[leaf]
-    z[leaf] = (1.2 + 0.6 * away * np.sin(angle))[leaf]
-    return np.column_stack([x, y, z])
+    across, up = _leaves(POINTS).T
+    xyz = np.column_stack([x, np.where(leaf, SPACING * draw.integers(0, ROWS, POINTS) + across, y), z + leaf * up])
+    around = shapely.box(*xyz[:, :2].min(axis=0) - 1, *xyz[:, :2].max(axis=0) + 1)
+    found = map_rows(PointCloud(deal(xyz, zones_of([around]))[0], parse_crs("EPSG:32632")))
+    find_canopies(found.cloud, found.rows, found.gaps, found.dtm, Settings())
+
+
+def model_canopies_of_none() -> None:
+    """Model made-up canopies of a row's sections."""
+    import numpy as np
+
+    from vinemap.canopy.foliage import Canopy
+    from vinemap.canopy.model import model_sections
+    from vinemap.canopy.points import Sections
+    from vinemap.geo.crs import parse_crs
+
+    m, each = 20, 50
+    member, leaves = np.arange(m * each, dtype=np.int32), _leaves(m * each)
+    position, spacing, along = np.linspace(0, LENGTH, m), np.full(m, SPACING), np.tile([1.0, 0.0], (m, 1))
+    start, places = np.arange(m + 1) * each, np.column_stack([position, np.zeros((m, 2))])
+    heights = leaves[:, 1].astype(np.float32)
+    sections = Sections(np.zeros(m, dtype=np.int64), position, places, along, spacing, start, leaves, heights, member)
+    model_sections([Canopy(sections, np.zeros((m, 3, 2)), np.ones(m))], parse_crs("EPSG:32632"))
+
+
+def _leaves(n: int) -> NDArray[np.float64]:
+    """Points (n, 2) of a canopy's section: metres across it and above ground."""
+    import numpy as np
+
+    draw = np.random.default_rng(1)
+    angle, away = draw.uniform(0, 2 * np.pi, n), np.sqrt(draw.uniform(0, 1, n))
+    return np.column_stack([0.3 * away * np.cos(angle), 1.2 + 0.6 * away * np.sin(angle)])
