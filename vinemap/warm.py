@@ -114,10 +114,10 @@ def find_canopies_of_none() -> None:
 
 
 def model_canopies_of_none() -> None:
-    """Model made-up canopies of a row's sections."""
+    """Tell canopies from soil in made-up sections of a row, and model them."""
     import numpy as np
 
-    from vinemap.canopy.foliage import Canopy
+    from vinemap.canopy.foliage import separate_canopy
     from vinemap.canopy.model import model_sections
     from vinemap.canopy.points import Sections
     from vinemap.geo.crs import parse_crs
@@ -128,7 +128,7 @@ def model_canopies_of_none() -> None:
     start, places = np.arange(m + 1) * each, np.column_stack([position, np.zeros((m, 2))])
     heights = leaves[:, 1].astype(np.float32)
     sections = Sections(np.zeros(m, dtype=np.int64), position, places, along, spacing, start, leaves, heights, member)
-    model_sections([Canopy(sections, np.zeros((m, 3, 2)), np.ones(m))], parse_crs("EPSG:32632"))
+    model_sections([separate_canopy(sections)], parse_crs("EPSG:32632"))
 
 
 def _leaves(n: int) -> NDArray[np.float64]:
