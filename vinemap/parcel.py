@@ -264,8 +264,7 @@ def follow(
         if origin:
             check_near(origin, points.extent[0], points.crs)
         polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
-        known = recipe.known.lines if recipe.known else None
-        shift = None
+        known, shift = recipe.known.lines if recipe.known else None, None
         if known is not None and settings.rows.align and (shift := map_rows(points, settings, known=known).shift):
             points = moved(points, -shift.metres, _collector(settings, paths.tiles(draft) / "moved"))
         found = map_rows(points, settings, within=polygon, known=known, step=run)
@@ -313,8 +312,8 @@ def follow(
             "files": {path.name: path.stat().st_size for path in sorted(draft.iterdir())},
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
-    took = time.perf_counter() - began
-    return Summary(parcel, folder, len(rows), record["length_m"], took, tuple(record["warnings"]))
+    length, took = record["length_m"], time.perf_counter() - began
+    return Summary(parcel, folder, len(rows), length, took, tuple(record["warnings"]))
 
 
 def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:

@@ -81,9 +81,10 @@ def separate_canopy(
     m, top = len(sections.row_id), max_height
     if m:
         spacing = float(sections.spacing.max())
-        top, half = canopy_size(sections.points[:, 0].copy(), sections.height, spacing, max_height)
+        across = sections.points[:, 0].copy()
+        top, half = canopy_size(across, sections.height, spacing, max_height)
         half_width = half if half_width is None else half_width
-        floor = canopy_floor(sections.points[:, 0], sections.height, (top, half), spacing)
+        floor = canopy_floor(across, sections.height, (top, half), spacing)
         margin, min_height = min(margin, floor), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -224,12 +225,13 @@ def _densities(left: Values, height: Values, strips: Values, levels: int) -> Val
     """Points (k, levels) per metre of width in strips between k + 1 distances from a row, by heights of ``BIN``."""
     out = np.zeros((len(strips) - 1, levels))
     for p in range(len(left)):
-        away, level = abs(left[p]), int(np.floor(height[p] / BIN))
+        away, level = abs(left[p]), math.floor(height[p] / BIN)
         if 0 <= level < levels and away < strips[-1]:
             k = 0
             while away >= strips[k + 1]:
                 k += 1
             out[k, level] += 1
     for k in range(len(out)):
-        out[k] /= max(strips[k + 1] - strips[k], 1e-9)
+        for level in range(levels):
+            out[k, level] /= max(strips[k + 1] - strips[k], 1e-9)
     return out

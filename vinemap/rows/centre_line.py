@@ -82,24 +82,26 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
     centre: Values = np.zeros(n)
     for _ in range(4):
         _centroids(excess, offsets, centre, reach, measured, weight)
-        ranked[:] = weight
+        for i in range(n):
+            ranked[i] = weight[i]
         # Stations of a stray leaf or two tell nothing of the row's middle.
         typical = max(quantile(ranked, n, 0.7), 1e-9)
         for i in range(n):
             weight[i] *= min(max(2 * weight[i] / typical - 0.5, 0.0), 1.0)
-            robust[i] = 1.0
-        before = centre
+            robust[i] = weight[i]
+        before, moved = centre, 0.0
         for _ in range(3):
-            centre = _smoothed(measured, weight * robust, cutoff)
-            held = 0
+            centre, held = _smoothed(measured, robust, cutoff), 0
             for i in range(n):
                 if weight[i] > 0:
                     ranked[held] = abs(measured[i] - centre[i])
                     held += 1
             scale = 1.5 * quantile(ranked, held, 0.5) + 0.01 if held else 1.0
             for i in range(n):
-                robust[i] = 1 / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
-        if np.abs(centre - before).max() < SETTLED:
+                robust[i] = weight[i] / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
+        for i in range(n):
+            moved = max(moved, abs(centre[i] - before[i]))
+        if moved < SETTLED:
             break
     return centre
 
@@ -140,20 +142,34 @@ def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 
     wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
     """
     data, weight = (np.ascontiguousarray(v, dtype=float) for v in (values, weights))
-    if len(data) < 3:
-        return data.copy()
-    bands = _penalties(weight, float(cutoff), float(slope), max(float(ridge), 1e-9))
-    out: Values = _solve(bands, weight * data)
-    return out
+    return _whittaker(data, weight, float(cutoff), float(slope), float(ridge))
 
 
+@compiled
 def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
     """Values (n,) as their trend and a detail.
 
     Across a gap the detail fades and the trend leads: an end's own wiggle must not aim the bridge.
     """
-    trend = whittaker(values, weights, cutoff=TREND * cutoff)
-    return trend + whittaker(values - trend, weights, cutoff=cutoff, slope=SLOPE * cutoff, ridge=DETAIL)
+    none = float(np.float64(0.0))  # a plain 0 would have all compiled twice
+    trend = _whittaker(values, weights, TREND * cutoff, none, none)
+    detail: Values = np.empty(len(values))
+    for i in range(len(values)):
+        detail[i] = values[i] - trend[i]
+    detail = _whittaker(detail, weights, cutoff, SLOPE * cutoff, DETAIL + none)
+    for i in range(len(values)):
+        detail[i] += trend[i]
+    return detail
+
+
+@compiled
+def _whittaker(values: Values, weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
+    if len(values) < 3:
+        return values.copy()
+    weighted = np.empty(len(values))
+    for i in range(len(values)):
+        weighted[i] = weights[i] * values[i]
+    return _solve(_penalties(weights, cutoff, slope, max(ridge, 1e-9)), weighted)
 
 
 @compiled
