@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import geopandas as gpd
 import numpy as np
 import shapely
+import shapely.geometry
+from affine import Affine
 from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, find_objects, label
 from scipy.spatial import cKDTree
 
@@ -247,12 +249,12 @@ def _without_specks(mask: Flags, least: int) -> Flags:
 
 def _polygon(place: Flags, grid: Grid, window: tuple[slice, slice], *, hole: float) -> shapely.MultiPolygon:
     """Outline of cells in a window of a grid, of few vertices, without holes smaller than so many m²."""
+    from rasterio.features import shapes  # half a second of start-up, needed only here
+
     cell, (top, left) = grid.resolution, (edge.start for edge in window)
-    change = np.diff(np.pad(place, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, first), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
-    x0, x1 = (grid.west + (left + column) * cell for column in (first, last))
-    y0, y1 = (grid.north - (top + row + k) * cell for k in (1, 0))
-    whole = shapely.union_all(shapely.box(x0, y0, x1, y1))
+    corner = Affine(cell, 0, grid.west + left * cell, 0, -cell, grid.north - top * cell)
+    found = shapes(place.astype(np.uint8), mask=place, connectivity=4, transform=corner)
+    whole = shapely.multipolygons([shapely.geometry.shape(part) for part, _ in found])
     whole = shapely.simplify(whole, cell * max(STAIRS, ROUGH * np.count_nonzero(place) ** 0.5))
     kept = [
         shapely.Polygon(part.exterior, [ring for ring in part.interiors if shapely.Polygon(ring).area >= hole])
