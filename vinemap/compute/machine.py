@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +14,8 @@ MOST = 0.8
 """Share of the memory that processes take together."""
 LEAST = 1_500_000_000
 """Bytes that each has at the least: on small machines there are fewer."""
+M_ARENA_MAX = -8
+"""Of ``mallopt``: how many heaps there are."""
 _given: dict[str, int] = {}
 
 
@@ -52,3 +56,23 @@ def share(n: int) -> int:
 def most_processes() -> int:
     """Processes for which there are cores and memory."""
     return max(1, min(cores(), int(MOST * memory() / LEAST)))
+
+
+def one_heap() -> None:
+    """Have threads take memory from one heap: GNU's library gives each its own, of which none takes what another frees.
+
+    Before there are any.
+    """
+    _malloc("mallopt", M_ARENA_MAX, 1)
+
+
+def give_back() -> None:
+    """Give memory that is free in this process back to the system: GNU's library keeps it for the next arrays."""
+    _malloc("malloc_trim", 0)
+
+
+def _malloc(name: str, *values: int) -> None:
+    """Tell GNU's library; others haven't that function."""
+    if sys.platform == "linux":
+        with suppress(AttributeError, OSError):
+            getattr(ctypes.CDLL(None), name)(*values)

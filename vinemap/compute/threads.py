@@ -43,7 +43,12 @@ def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(machine.cores(), initializer=_mark_busy)
+    return _executor(machine.cores(), initializer=_mark_busy)
+
+
+def _executor(workers: int, initializer: Callable[[], None] | None = None) -> ThreadPoolExecutor:
+    machine.one_heap()
+    return ThreadPoolExecutor(workers, initializer=initializer)
 
 
 if hasattr(os, "register_at_fork"):
@@ -61,7 +66,7 @@ def aside() -> Iterator[Callable[..., Future[Any]]]:
     Given is ``start(function, *args, **kwargs)``, whose result tells when it's done, or its error. When the context
     ends by an error, what hasn't begun doesn't.
     """
-    pool = ThreadPoolExecutor(1, initializer=_mark_busy)
+    pool = _executor(1, initializer=_mark_busy)
     try:
         yield pool.submit
     finally:
@@ -78,7 +83,7 @@ def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
             coming = maker.submit(next, items, None)
             yield item
 
-    with ThreadPoolExecutor(1) as maker:
+    with _executor(1) as maker:
         yield following()
 
 

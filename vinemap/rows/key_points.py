@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Grid, Raster
     from vinemap.surfaces.waves import RowField
 
-BATCH = 5_000
+BATCH = 1_000
 WIDE = (1.0, 1.5, 2.0, 3.0)
 """Multiples of the smoothing for canopies that are the wider."""
 WIDTH_SHARE = 0.3

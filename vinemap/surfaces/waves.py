@@ -33,7 +33,7 @@ PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
-BATCH = 128
+BATCH = 16
 
 
 class Peaks(NamedTuple):
@@ -53,7 +53,7 @@ def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, 
     hann = np.hanning(windows.shape[-1] + 1)[:-1]
     taper = (hann[:, None] * hann).astype(np.float32)
     batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    waves = in_threads(lambda batch: _strongest_wave(windows[batch], taper, band), batches)
+    waves = in_threads(lambda batch: _strongest_wave(windows[*batch.T], taper, band), batches)
     return _peaks(waves, occupied, shape)
 
 
@@ -80,7 +80,7 @@ def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float,
 
     def waves(batch: Ints) -> Values:
         k = np.arange(len(batch))
-        histogram = (sums @ windows[batch][:, inside].T).T.reshape(len(batch), len(angles), n) / size
+        histogram = (sums @ windows[*batch.T][:, inside].T).T.reshape(len(batch), len(angles), n) / size
         histogram -= np.average(histogram, axis=2, weights=np.broadcast_to(size, histogram.shape))[:, :, None]
         best = (histogram**2 * size).sum(axis=2).argmax(axis=1)
         profile = histogram[k, best] * np.sqrt(size[best] / size.max())
@@ -98,7 +98,10 @@ def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float,
 
 
 def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple[int, int]]:
-    """Windows (nodes, 2 half, 2 half) on a grid of nodes (my, mx) from the raster's corner, which are near canopy."""
+    """Windows (my, mx, 2 half, 2 half) on a grid of nodes from the raster's corner, and those (k, 2) near canopy.
+
+    They are a view: those of many nodes at once would take far more memory than the raster.
+    """
     size = 2 * half
     stride = max(1, round(step / COVER_RESOLUTION))
     # Windows reach over the edge by half their width; what lies there is no canopy.
@@ -107,20 +110,20 @@ def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple
     padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover[
         : padded.shape[0] - half, : padded.shape[1] - half
     ]
-    windows = sliding_window_view(padded, (size, size))[::stride, ::stride].reshape(-1, size, size)
+    windows = sliding_window_view(padded, (size, size))[::stride, ::stride]
     reach = 2 * round((NEAR + step) / COVER_RESOLUTION) + 1
     canopy = np.pad(maximum_filter(cover, reach) > LEAST_COVER, [(0, 2 * stride)], mode="edge")
-    return windows, np.flatnonzero(canopy[::stride, ::stride][:my, :mx]), (my, mx)
+    return windows, np.argwhere(canopy[::stride, ::stride][:my, :mx]), (my, mx)
 
 
 def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> list[Peaks]:
     """Waves (3 or 6, k) of batches of windows, in their places."""
     sets = len(waves[0]) // 3 if waves else 1
-    out = np.zeros((sets, 3, shape[0] * shape[1]))
+    out = np.zeros((sets, 3, *shape))
     out[:, :2] = np.nan
     if waves:
-        out[:, :, occupied] = np.concatenate(waves, axis=1).reshape(sets, 3, -1)
-    return [Peaks(*one) for one in out.reshape(sets, 3, *shape)]
+        out[:, :, *occupied.T] = np.concatenate(waves, axis=1).reshape(sets, 3, -1)
+    return [Peaks(*one) for one in out]
 
 
 def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
