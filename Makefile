@@ -66,7 +66,7 @@ odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/acc
 	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.measure.odometry $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
-	@$(BIN)/python -m vinemap.measure.bench $(if $(SIZES),--sizes "$(SIZES)",--docs docs/speed.md)
+	@$(BIN)/python -m vinemap.measure.bench $(if $(SIZES),--sizes "$(SIZES)" --dense "$(SIZES)",--docs docs/speed.md)
 
 picture: $(READY) ## Draw README's picture of a product: make parcel PARCEL=curved picture
 	@$(BIN)/python -m vinemap.measure.picture data/products/barolo/$(or $(PARCEL),curved) $(or $(PARCEL),curved) docs/picture.png

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from vinemap.errors import VinemapError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
 
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
@@ -34,11 +34,11 @@ class Outcome(NamedTuple):
     """The last line of its stderr."""
 
 
-def run_process(command: Sequence[str], *, limit: float | None = None) -> Outcome:
-    """Run a command, kill it after ``limit`` seconds, and measure it."""
+def run_process(command: Sequence[str], *, limit: float | None = None, env: Mapping[str, str] | None = None) -> Outcome:
+    """Run a command, kill it after ``limit`` seconds, and measure it; ``env`` is its environment, by default ours."""
     with tempfile.TemporaryFile() as stderr:
         began = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr)  # noqa: S603 - our own
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr, env=env)  # noqa: S603 - our own
         timer = threading.Timer(limit or threading.TIMEOUT_MAX, process.kill)
         timer.daemon = True
         timer.start()
@@ -67,15 +67,15 @@ def _wait(process: subprocess.Popen[bytes]) -> int:
     return 0
 
 
-def must(command: Sequence[str]) -> Outcome:
-    """Run a command that has to go well.
+def must(command: Sequence[str], *, env: Mapping[str, str] | None = None) -> Outcome:
+    """Run a command that has to go well, in an environment, by default ours.
 
     Raises
     ------
     VinemapError
         If it doesn't.
     """
-    outcome = run_process(command)
+    outcome = run_process(command, env=env)
     if outcome.code:
         raise VinemapError(f"{' '.join(command[1:4])} ended with code {outcome.code}: {outcome.said}")
     return outcome

@@ -71,7 +71,7 @@ def compare_canopies(
     soil_good, soil_under, soil_over = _against_truth(survey.foliage, outlines, on_soil)
     rows = summarise_rows(found.rows, model.table, step=step)
     mine, true = pairs["row_id"].to_numpy(dtype=int) - 1, pairs["reference"].to_numpy(dtype=int) - 1
-    volume = _true_volumes(survey)[true]
+    volume = true_volumes(survey)[true]
     return CanopyErrors(
         good,
         under,
@@ -114,7 +114,7 @@ def _against_truth(foliage: Foliage, outlines: Floats, model: CanopyModel) -> tu
     return np.asarray(good), np.asarray(under), np.asarray(over)
 
 
-def _true_volumes(survey: Survey) -> Floats:
+def true_volumes(survey: Survey) -> Floats:
     """Volume (rows,) of the foliage in m³, leaves' reach included."""
     area = shapely.area(shapely.polygons(foliage_outlines(survey.foliage)))
     weights = area * survey.foliage.step

@@ -45,7 +45,6 @@ def best(function: Callable[[], T], *, turns: int = TURNS) -> tuple[float, T]:
 
 def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
     """The cloth simulation filter, and a raster of its ground points, beside the terrain model."""
-    import CSF
     import shapely
 
     from vinemap.geo.boundaries import read_boundary
@@ -53,20 +52,8 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
 
     xyz, found = mapped(cloud, boundary)
 
-    def filtered() -> Floats:
-        csf = CSF.CSF()
-        csf.params.cloth_resolution = 0.5
-        csf.params.class_threshold = 0.2
-        csf.params.rigidness = 2
-        csf.params.bSloopSmooth = True
-        csf.setPointCloud(xyz)
-        inside, outside = CSF.VecInt(), CSF.VecInt()
-        csf.do_filtering(inside, outside, False)  # noqa: FBT003 - it knows no keywords
-        soil: Floats = xyz[np.array(inside)]
-        return soil
-
     before = held_now()
-    filtering, soil = best(filtered)
+    filtering, soil = best(lambda: xyz[cloth(xyz)])
     rasterising, theirs = best(lambda: rasterised(soil, found.dtm))
 
     parcel = read_boundary(Path(boundary))[0]
@@ -83,6 +70,21 @@ def ground(cloud: str, boundary: str, millions: float) -> dict[str, str]:
         "result": f"{said[0]}{memory_since(before)}",
         "ours": said[1],
     }
+
+
+def cloth(xyz: Floats) -> NDArray[np.intp]:
+    """Ground among points (n, 3), by the cloth simulation filter: their indices."""
+    import CSF
+
+    csf = CSF.CSF()
+    csf.params.cloth_resolution = 0.5
+    csf.params.class_threshold = 0.2
+    csf.params.rigidness = 2
+    csf.params.bSloopSmooth = True
+    csf.setPointCloud(xyz)
+    inside, outside = CSF.VecInt(), CSF.VecInt()
+    csf.do_filtering(inside, outside, False)  # noqa: FBT003 - it knows no keywords
+    return np.array(inside, dtype=np.intp)
 
 
 def rasterised(soil: Floats, like: Raster) -> Raster:

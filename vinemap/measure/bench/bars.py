@@ -12,12 +12,43 @@ ALL = "All"
 OTHER = "other"
 ROWS = ("DTM", "Ends and gaps")
 """First and last of the stages that find rows."""
-SMALL = 3e6
-"""Points below which a bar is a matter of seconds."""
+SMALL, LARGE = 3e6, 16e6
+"""Points below which a bar is a matter of seconds, and from which the final bars hold."""
 HECTARE = 10_000.0
-START_UP = 2.0
-"""Seconds."""
 BASE = 2e6
+START = 0.9
+"""Seconds before reading begins."""
+WRONG = 2.0
+"""Rows (%) that may be missed or found beside the true ones."""
+A_KILOMETRE = 0.6
+"""Seconds a kilometre of row, in vineyards that are planted densely."""
+GROWTH = 1.15
+"""Of the seconds a point, from ``BASE`` to the largest survey."""
+EXPONENT = 1.02
+"""Of seconds against points, in vineyards that are planted densely."""
+
+MANY_TIMES, MANY_MEMORY = 1.8, 1200
+"""Times the seconds of reading, and MB, of many parcels in one job."""
+COLD, GOAL = 12.0, 8.0
+"""Seconds that a run with an empty cache may take beyond a warm one, and shall."""
+
+
+class Found(NamedTuple):
+    """What a run, or what stands in for one, found, against the simulated truth."""
+
+    rows: int
+    """That there are."""
+    right: int
+    extra: int
+    length: float
+    """Of the rows that were found, m."""
+    volume: float
+    """Error of all canopies' volume, as a share of it."""
+
+    @property
+    def wrong(self) -> float:
+        """Rows that were missed or found beside the true ones, % of these."""
+        return 100 * (self.rows - self.right + self.extra) / self.rows
 
 
 class Run(NamedTuple):
@@ -33,12 +64,21 @@ class Run(NamedTuple):
     """Most memory that takes, bytes."""
     wall: float
     """Seconds of the command, as a user waits."""
+    start: float
+    """Those of them before reading begins."""
     peak: int
     """Most memory of the command, bytes."""
     seconds: dict[str, float]
     """Of every stage in order, of what lies between them, and of all."""
     peaks: dict[str, int | None]
     """Most memory (bytes) in every stage; None where the system doesn't tell."""
+    found: Found
+
+    @property
+    def per_kilometre(self) -> float:
+        """Seconds a kilometre of row of the command, less twice those of reading; infinite where no row was found."""
+        length = self.found.length / 1000
+        return (self.wall - 2 * self.reading) / length if length else math.inf
 
 
 class Bar(NamedTuple):
@@ -80,17 +120,41 @@ def growth_ratio(runs: Sequence[Run]) -> float:
 
 
 def bars(run: Run) -> list[Bar]:
-    """What is promised of every size."""
-    small, hectares = run.points < SMALL, run.area / HECTARE
-    rows = 2.0 if small else run.reading + hectares
-    whole = 4.0 if small else 2 * run.reading + 2 * hectares
-    terms = "{} × reading + {} s a hectare; below 3 M points {} s"
+    """What is promised of every size of F's shape."""
+    hectares = run.area / HECTARE
+    if run.points >= LARGE:
+        rows, whole = 0.5 * run.reading + 0.5 * hectares, 1.5 * run.reading + hectares
+    else:
+        rows, whole = (2.0, 4.0) if run.points < SMALL else (run.reading + hectares, 2 * run.reading + 2 * hectares)
+    terms = "{} × reading + {} s a hectare; below 16 M points {} ×, {} s; below 3 M points {} s"
     return [
-        Bar(f"rows ({ROWS[0]} … {ROWS[1]}), s", terms.format(1, 1, 2), span(run.seconds, *ROWS), rows),
-        Bar("whole parcel, s", terms.format(2, 2, 4), run.seconds[ALL], whole),
-        Bar("start-up, s", "2 s", run.wall - run.seconds[ALL], START_UP),
+        Bar(f"rows ({ROWS[0]} … {ROWS[1]}), s", terms.format(0.5, 0.5, 1, 1, 2), span(run.seconds, *ROWS), rows),
+        Bar("whole parcel, s", terms.format(1.5, 1, 2, 2, 4), run.seconds[ALL], whole),
+        _start(run),
         Bar("most memory, MB", "60 bytes a point + 400 MB", run.peak / 1e6, 60e-6 * run.points + 400, 0),
+        _wrong(run),
     ]
+
+
+def dense_bars(run: Run) -> list[Bar]:
+    """What is promised of every size of a vineyard that is planted densely."""
+    whole = A_KILOMETRE * run.found.length / 1000 + 2 * run.reading
+    memory = 60e-6 * run.points + 15 * run.area / HECTARE + 350
+    return [
+        Bar("whole run, s", f"{A_KILOMETRE} s a km of row + 2 × reading", run.wall, whole),
+        Bar("s a km of row, beyond 2 × reading", f"{A_KILOMETRE}", run.per_kilometre, A_KILOMETRE),
+        _start(run),
+        Bar("most memory, MB", "60 bytes a point + 15 MB a hectare + 350 MB", run.peak / 1e6, memory, 0),
+        _wrong(run),
+    ]
+
+
+def _start(run: Run) -> Bar:
+    return Bar("start before reading, s", f"{START} s", run.start, START)
+
+
+def _wrong(run: Run) -> Bar:
+    return Bar("rows missed or extra, %", f"{WRONG:g}% of the true ones", run.found.wrong, WRONG, 1)
 
 
 def of_bar(bar: Bar) -> str:

@@ -13,14 +13,15 @@ import numpy as np
 
 from vinemap.compute.processes import high_water
 from vinemap.measure.bench.alternatives import best, ground, polygons, rows
-from vinemap.measure.bench.surveys import estate, survey
+from vinemap.measure.bench.surveys import estate, example, survey
+from vinemap.measure.bench.whole import whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 MEMORY = 0.75
 """Share of the machine's memory that a job may address."""
-INSTEAD = ground, rows, polygons
+INSTEAD = ground, rows, polygons, whole
 
 
 def reading(cloud: str) -> dict[str, Any]:
@@ -52,7 +53,23 @@ def peaks(cloud: str, boundary: str, out: str) -> dict[str, int | None]:
     return held
 
 
-OURS = survey, estate, reading, peaks
+def judged(rows: str, truth: str, volume: float) -> dict[str, Any]:
+    """What of rows, with their volumes, is right (:class:`vinemap.measure.bench.bars.Found`)."""
+    from vinemap.evaluate.rows import evaluate_rows
+    from vinemap.geo.lines import read_lines
+
+    found, drawn = read_lines(rows, "rows"), read_lines(truth, "rows")
+    evaluation = evaluate_rows(found[["geometry"]], drawn[["geometry"]])
+    return {
+        "rows": len(drawn),
+        "right": len(evaluation.pairs),
+        "extra": len(evaluation.extra_rows),
+        "length": float(found.length.sum()),
+        "volume": float(found["volume_m3"].sum()) / volume - 1,
+    }
+
+
+OURS = survey, estate, example, reading, peaks, judged
 
 JOBS: Mapping[str, Callable[..., dict[str, Any]]] = {job.__name__: job for job in OURS + INSTEAD}
 

@@ -27,7 +27,7 @@ def draw(runs: Sequence[Run], path: Path) -> None:
     from matplotlib.ticker import LogLocator
 
     points = [run.points / 1e6 for run in runs]
-    rows, whole, _, memory = zip(*map(bars, runs), strict=True)
+    rows, whole, _, memory, _ = zip(*map(bars, runs), strict=True)
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     lines = {"laspy.read, xyz": ("k--", [run.reading for run in runs], [run.reading_peak / 1e6 for run in runs])}

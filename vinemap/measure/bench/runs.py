@@ -1,47 +1,29 @@
-"""Runs of the benchmark: every size, what a user would pick instead, many parcels in one job, Prefect."""
+"""Runs of the benchmark: every size, many parcels in one job, a cold start, Prefect."""
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+import tempfile
+import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vinemap import paths
-from vinemap.compute.processes import must, run_process, summed_memory
-from vinemap.measure.bench.bars import Bar, Run, of_bar, span, with_other
+from vinemap.compute.processes import must, summed_memory
+from vinemap.measure.bench.bars import ALL, COLD, GOAL, MANY_MEMORY, MANY_TIMES, Bar, Found, Run, of_bar, with_other
 
 if TYPE_CHECKING:
     from vinemap.measure.bench.tables import Lines
 
-LIMIT = 600.0
-"""Seconds that an alternative may take."""
+TURNS = {"F": 2, "dense": 3}
+"""Of each family, of which the fastest counts."""
+COLD_TURNS = 3
 EXAMPLE = Path("configs/barolo.yaml")
-
-
-class Alternative(NamedTuple):
-    """What a user would pick instead of a step."""
-
-    step: str
-    job: str
-    """Of ``vinemap.measure.bench.jobs``."""
-    module: str
-    """That it needs."""
-    stages: tuple[str, str] | None
-    """First and last of ours that do the same; None where the job times ours as well."""
-    thin: float | None = None
-    """Cells (m) of which each leaves a point; 0 leaves all."""
-
-
-ALTERNATIVES = [
-    Alternative("ground", "ground", "CSF", ("DTM", "DTM")),
-    Alternative("rows", "rows", "sklearn", ("Canopy cover", "Curves"), thin=0.0),
-    Alternative("rows, thinned", "rows", "sklearn", ("Canopy cover", "Curves"), thin=0.1),
-    Alternative("c-gons", "polygons", "cv2", None),
-]
 
 
 def job(name: str, result: Path, **arguments: Any) -> list[str]:
@@ -60,27 +42,33 @@ def vinemap_run(cloud: Path | str, *options: str) -> list[str]:
     return [sys.executable, "-m", "vinemap", "run", str(cloud), *options]
 
 
-def ensure_survey(millions: float, out: Path) -> dict[str, Any]:
-    """Files of the survey of that size, and the area (m²) of its parcel; simulated if it isn't there."""
-    made = out / "jobs" / f"survey-{millions:g}M.json"
-    must(job("survey", made, millions=millions, folder=str(out / "surveys")))
+def ensure_survey(millions: float, out: Path, family: str = "F") -> dict[str, Any]:
+    """Files of the survey of that size and family, and its parcel's area (m²) and canopies' volume (m³)."""
+    made = out / "jobs" / f"survey-{family}-{millions:g}M.json"
+    must(job("survey", made, millions=millions, folder=str(out / "surveys"), family=family))
     survey: dict[str, Any] = load(made)
     return survey
 
 
-def measure(millions: float, out: Path) -> Run:
-    """Measure one size: reading, then twice the whole command, of which the faster counts, then memory by stage."""
-    survey = ensure_survey(millions, out)
-    read, held = (out / "jobs" / f"{name}-{millions:g}M.json" for name in ("reading", "peaks"))
-    product = out / "products" / f"{millions:g}M"
+def measure(millions: float, out: Path, family: str = "F") -> Run:
+    """Measure one size: reading, a few times the whole command, of which the fastest counts, then memory by stage."""
+    survey = ensure_survey(millions, out, family)
+    name = f"{family}-{millions:g}M"
+    read, held = (out / "jobs" / f"{kind}-{name}.json" for kind in ("reading", "peaks"))
+    product = out / "products" / name
+    record = paths.run_record(product)
     plain = must(job("reading", read, cloud=survey["cloud"]))
     turns = []
-    for _ in range(2):
+    for _ in range(TURNS[family]):
+        began = time.time()
         whole = must(vinemap_run(survey["cloud"], "--boundary", survey["boundary"], "--out", str(product)))
-        turns.append((whole.seconds, whole.peak, load(paths.run_record(product))["seconds"]))
-    wall, peak, seconds = min(turns, key=lambda turn: turn[0])
+        seconds = load(record)["seconds"]
+        start = record.stat().st_mtime - seconds[ALL] - began  # the record is the last that is written
+        turns.append((whole.seconds, whole.peak, start, seconds))
+    wall, peak, start, seconds = min(turns, key=lambda turn: turn[0])
     files = {key: survey[key] for key in ("cloud", "boundary")}
     must(job("peaks", held, **files, out=f"{product}-peaks"))
+    rows = paths.geopackage(product, paths.stem(Path(survey["cloud"])))
     found = load(read)
     return Run(
         found["points"],
@@ -88,35 +76,18 @@ def measure(millions: float, out: Path) -> Run:
         found["seconds"],
         plain.peak,
         wall,
+        start,
         peak,
         with_other(seconds),
         load(held),
+        judge(rows, survey, out / "jobs" / f"found-{name}.json"),
     )
 
 
-def instead(millions: float, run: Run, out: Path, *, limit: float = LIMIT) -> Lines:
-    """Table of what a user would pick instead of a step, on the survey of that size, beside ours in its run."""
-    survey = ensure_survey(millions, out)
-    lines = [["step", "instead", "takes", "gives", "ours takes", "ours gives"]]
-    for one in ALTERNATIVES:
-        ours = f"{span(run.seconds, *one.stages):.2f} s" if one.stages else "–"
-        if find_spec(one.module) is None:
-            how = f"{one.module} isn't installed: pip install 'vinemap[bench]'"
-            lines.append([one.step, how, "–", "–", ours, "–"])
-            continue
-        click.echo(f"{one.step} instead…", err=True)
-        result = out / "jobs" / f"instead-{one.job}.json"
-        given = {key: survey[key] for key in ("cloud", "boundary")}
-        given |= {"millions": millions} if one.job == "ground" else {}
-        given |= {"truth": survey["truth"], "thin": one.thin} if one.job == "rows" else {}
-        outcome = run_process(job(one.job, result, **given), limit=limit)
-        if outcome.code:
-            lines.append([one.step, one.module, "–", outcome.said, ours, "–"])
-            continue
-        found = load(result)
-        parts = (found["tool"], found["seconds"], found["result"], found.get("our_seconds", ours), found["ours"])
-        lines.append([one.step, *parts])
-    return lines
+def judge(rows: Path, survey: dict[str, Any], result: Path) -> Found:
+    """Hold rows and their volumes, in a GeoPackage, against the truth of a survey."""
+    must(job("judged", result, rows=str(rows), truth=survey["truth"], volume=survey["volume"]))
+    return Found(**load(result))
 
 
 def many(millions: float, parcels: int, out: Path) -> Lines:
@@ -131,8 +102,8 @@ def many(millions: float, parcels: int, out: Path) -> Lines:
     with summed_memory() as most:
         whole = must([*command, "--boundaries", files["boundaries"], "--out", str(products)])
     found = load(read)
-    seconds = Bar("", "", whole.seconds, 2.5 * found["seconds"], 1)
-    memory = of_bar(Bar("", "", most[0] / 1e6, 2000, 0)) if most[0] else "–"
+    seconds = Bar("", "", whole.seconds, MANY_TIMES * found["seconds"], 1)
+    memory = of_bar(Bar("", "", most[0] / 1e6, MANY_MEMORY, 0)) if most[0] else "–"
     return [
         ["survey", "laspy.read, xyz", "one job", "all its processes' memory, MB"],
         [
@@ -140,6 +111,31 @@ def many(millions: float, parcels: int, out: Path) -> Lines:
             f"{found['seconds']:.1f} s",
             f"{of_bar(seconds)} s",
             memory,
+        ],
+    ]
+
+
+def cold(out: Path) -> Lines:
+    """Table of what a first run takes that has to compile: parcel F of the example, with an empty cache and with it."""
+    click.echo("Cold start…", err=True)
+    made = out / "jobs" / "example.json"
+    must(job("example", made, folder=str(out / "surveys")))
+    files = load(made)
+    command = vinemap_run(files["cloud"], "--boundary", files["boundary"], "--parcel", "F")
+    command += ["--out", str(out / "products" / "cold")]
+    turns = []
+    for _ in range(COLD_TURNS):
+        with tempfile.TemporaryDirectory() as cache:
+            env = os.environ | {"NUMBA_CACHE_DIR": cache}
+            turns.append([must(command, env=env).seconds for _ in range(2)])
+    first, again = map(min, zip(*turns, strict=True))
+    return [
+        ["parcel F of barolo", "with an empty cache", "again", "beyond warm"],
+        [
+            f"best of {COLD_TURNS}",
+            f"{first:.1f} s",
+            f"{again:.1f} s",
+            f"{of_bar(Bar('', '', first - again, COLD, 1))} s; {GOAL:g} s are the goal",
         ],
     ]
 

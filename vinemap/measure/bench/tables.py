@@ -10,11 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinemap import __version__
-from vinemap.measure.bench.bars import ALL, HECTARE, Bar, Run, bars, growth_exponent, growth_ratio, of_bar
+from vinemap.measure.bench.bars import (
+    ALL,
+    EXPONENT,
+    GROWTH,
+    HECTARE,
+    Bar,
+    Run,
+    bars,
+    dense_bars,
+    growth_exponent,
+    growth_ratio,
+    of_bar,
+)
 from vinemap.measure.tables import as_markdown, fill
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 Lines = list[list[str]]
 """A table, headings first."""
@@ -27,16 +39,35 @@ def size_of(run: Run) -> str:
 
 
 def bar_table(runs: Sequence[Run]) -> Lines:
-    """Table of what is promised: a line a bar, a column a size."""
-    columns = [bars(run) for run in runs]
-    lines = [["figure", "may be", *map(size_of, runs)]]
-    lines += [[line[0].name, line[0].terms, *map(of_bar, line)] for line in zip(*columns, strict=True)]
-    ratio, rest = growth_ratio(runs), [""] * (len(runs) - 1)
+    """Table of what is promised of F's shape: a line a bar, a column a size."""
+    lines, rest = _promised(runs, bars), [""] * (len(runs) - 1)
+    ratio, exponent = growth_ratio(runs), _exponent(runs)
     growth = "–" if math.isnan(ratio) else of_bar(Bar("", "", ratio, GROWTH))
     lines.append(["seconds a point, over those at 2 M", f"{GROWTH} at the largest", *rest, growth])
-    exponent = growth_exponent([run.points for run in runs], [run.seconds[ALL] for run in runs])
     lines.append(["growth exponent of the whole", "", *rest, "–" if math.isnan(exponent) else f"{exponent:.2f}"])
     return lines
+
+
+def dense_table(runs: Sequence[Run]) -> Lines:
+    """Table of what is promised of vineyards that are planted densely: a line a bar, a column a size."""
+    lines, rest = _promised(runs, dense_bars), [""] * (len(runs) - 1)
+    exponent = _exponent(runs)
+    growth = "–" if math.isnan(exponent) else of_bar(Bar("", "", exponent, EXPONENT))
+    lines.append(["km of row found", "", *[f"{run.found.length / 1000:.1f}" for run in runs]])
+    lines.append(["laspy.read, xyz, s", "", *[f"{run.reading:.2f}" for run in runs]])
+    lines.append(["growth exponent of the whole", f"{EXPONENT}", *rest, growth])
+    return lines
+
+
+def _promised(runs: Sequence[Run], of: Callable[[Run], Sequence[Bar]]) -> Lines:
+    """Headings, and a line a bar."""
+    lines = [["figure", "may be", *map(size_of, runs)]]
+    columns = zip(*map(of, runs), strict=True)
+    return lines + [[line[0].name, line[0].terms, *map(of_bar, line)] for line in columns]
+
+
+def _exponent(runs: Sequence[Run]) -> float:
+    return growth_exponent([run.points for run in runs], [run.seconds[ALL] for run in runs])
 
 
 def stage_table(runs: Sequence[Run]) -> Lines:
@@ -80,7 +111,3 @@ def write_tables(tables: Mapping[str, Lines], path: Path) -> None:
     for name, lines in tables.items():
         text = fill(text, name, as_markdown(lines))
     path.write_text(text, encoding="utf-8")
-
-
-GROWTH = 1.15
-"""Of the seconds a point, from ``BASE`` to the largest survey."""
