@@ -17,12 +17,12 @@ READY := $(VENV)/.ready
 READY_BENCH := $(VENV)/.ready-bench
 LOG := $(VENV)/install.log
 
-.PHONY: help parcel survey nightly test test-qgis check accuracy fuzz odometry bench picture tune web clean
+.PHONY: help parcel survey nightly test test-qgis test-installed check accuracy fuzz odometry bench picture tune web clean
 
 help: ## List the verbs
 	@echo "make VERB, where VERB is one of"
 	@sed -nE 's/^([a-z-]+):[^#]*## (.*)$$/\1 \2/p' $(firstword $(MAKEFILE_LIST)) | \
-	  while read -r verb does; do printf '  %-9s %s\n' "$$verb" "$$does"; done
+	  while read -r verb does; do printf '  %-14s %s\n' "$$verb" "$$does"; done
 
 parcel: export CONFIG ?= configs/barolo.yaml
 parcel: export PARCEL := $(PARCEL)
@@ -30,7 +30,7 @@ parcel: $(if $(strip $(PARCEL)),$(READY)) ## Map one parcel: make parcel PARCEL=
 ifeq ($(strip $(PARCEL)),)
 	@echo "Name the parcel, for example: make parcel PARCEL=F" >&2; exit 2
 else
-	@$(BIN)/python -m flows.parcel "$$CONFIG" "$$PARCEL"
+	@$(BIN)/vinemap parcel --config "$$CONFIG" -- "$$PARCEL"
 endif
 
 survey: export SURVEY := $(SURVEY)
@@ -38,18 +38,21 @@ survey: $(if $(strip $(SURVEY)),$(READY)) ## Map all parcels of a survey that ne
 ifeq ($(strip $(SURVEY)),)
 	@echo "Name the survey, for example: make survey SURVEY=barolo" >&2; exit 2
 else
-	@$(BIN)/python -m flows.survey "$$SURVEY" $(if $(AGAIN),--again)
+	@$(BIN)/vinemap survey $(if $(AGAIN),--again) -- "$$SURVEY"
 endif
 
 nightly: export CONFIG ?= configs/nightly.yaml
 nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=configs/nightly.yaml]
-	@exec $(BIN)/python -m flows.nightly "$$CONFIG" --serve
+	@exec $(BIN)/vinemap nightly --config "$$CONFIG"
 
 test: $(READY) ## Run the tests, two files at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis
 	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py
+
+test-installed: $(READY) ## Install vinemap by pip outside of this folder, and map with it (needs a package index)
+	@VINEMAP_TEST_INSTALLED=1 $(BIN)/python -m pytest -n 0 tests/test_installed.py
 
 check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check
@@ -89,7 +92,7 @@ $(READY): pyproject.toml configs/constraints.txt
 	@if [ -e $@ ]; then echo "Bringing $(VENV) up to date…"; else echo "Setting up $(VENV) (about 1.6 GB, a minute or two)…"; fi
 	@rm -f $@; mkdir -p $(VENV)
 	@{ $(PYTHON) -m venv $(VENV) && \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[dev]'; \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[all,dev]'; \
 	} >$(LOG) 2>&1 || { \
 	  grep -v 'is ignored: it is neither' $(LOG) | tail -n 15 >&2; \
 	  echo "Setting up $(VENV) failed; all that was said stands in $(LOG)" >&2; \
@@ -100,7 +103,7 @@ $(READY): pyproject.toml configs/constraints.txt
 
 $(READY_BENCH): $(READY)
 	@echo "Adding to $(VENV) what make bench compares with…"
-	@$(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[dev,bench]' >$(LOG) 2>&1 || { \
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -c configs/constraints.txt -e '.[all,dev,bench]' >$(LOG) 2>&1 || { \
 	  grep -v 'is ignored: it is neither' $(LOG) | tail -n 15 >&2; \
 	  echo "Adding to $(VENV) failed; all that was said stands in $(LOG)" >&2; \
 	  exit 1; \

@@ -15,16 +15,17 @@ from prefect import State, flow, get_run_logger
 from prefect.artifacts import create_table_artifact
 from prefect.states import Completed, Failed
 
-from flows.serving import serve
-from flows.survey import COLUMNS, outcomes_of, rows_of, show
 from vinemap import paths
-from vinemap.cli.terminal import plain_errors
 from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.jobs.estate import Arrival, arrivals
-from vinemap.jobs.plan import FAILED, Outcome, plan_survey
+from vinemap.jobs.plan import COLUMNS, FAILED, Outcome, in_table, plan_survey
 from vinemap.jobs.register import is_due
 from vinemap.jobs.survey import map_survey
+from vinemap.terminal import plain_errors, show
+
+from .serving import serve
+from .survey import outcomes_of
 
 PASSED = "passed over"
 """State of a file that can't be used."""
@@ -45,7 +46,7 @@ class Night(NamedTuple):
         passed = [(self.survey, "", "", "", PASSED, remark) for remark in self.passed]
         if self.reason:
             return [(self.survey, "", "", "", FAILED if self.failed else "waits", self.reason), *passed]
-        return [*((self.survey, *row) for row in rows_of(self.outcomes)), *passed]
+        return [*((self.survey, *row) for row in in_table(self.outcomes)), *passed]
 
 
 @flow(name="nightly", persist_result=False)
@@ -105,10 +106,27 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
 @click.option("--every", type=click.FloatRange(1), help="Seconds from run to run, instead of CONFIG's cron.")
 def command(config: str, served: bool, every: float | None) -> None:
     """Map the parcels of all surveys that need it; exit code 1 if one of them fails."""
+    work(config, served=served, every=every)
+
+
+def work(config: str, *, served: bool, every: float | None = None) -> None:
+    """Map what needs it: now, which ends with exit code 1 if a survey fails, or staying, when the estate's file says.
+
+    Parameters
+    ----------
+    config : str
+        File of the estate's configuration.
+    served : bool
+        Whether to stay.
+    every : float, optional
+        Seconds from run to run, instead of the file's cron.
+    """
     estate = load_estate(Path(config))
     if served:
         given = {"config": config}
-        serve("flows.nightly.nightly", parameters=given, cron=estate.cron, timezone=estate.timezone, every=every)
+        serve(
+            f"{__package__}.nightly.nightly", parameters=given, cron=estate.cron, timezone=estate.timezone, every=every
+        )
         return
     state = nightly(config, return_state=True)
     nights: Any = state.result(raise_on_failure=False)

@@ -13,12 +13,13 @@ import click
 from prefect import flow, get_run_logger
 from prefect.states import Completed, Failed
 
-from flows.parcel import as_tasks
 from vinemap import paths
-from vinemap.cli.terminal import frame_progress, plain_errors
 from vinemap.config.drives import DrivesConfig, load_camera, load_drives
 from vinemap.errors import ConfigError, OutputError, VinemapError, own_fault
 from vinemap.odometry.drive import map_drive
+from vinemap.terminal import frame_progress, plain_errors
+
+from .parcel import as_tasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -137,8 +137,8 @@ def _start(api: str, port: int, folder: Path, log: Path) -> subprocess.Popen[byt
     try:
         with log.open("wb") as output:
             # Ctrl-C mustn't reach it before the runs have ended.
-            return subprocess.Popen(
-                [sys.executable, "-m", "flows.server"],
+            return subprocess.Popen(  # noqa: S603 - this module
+                [sys.executable, "-m", f"{__package__}.server"],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=output,

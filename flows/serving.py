@@ -31,9 +31,10 @@ from prefect.states import Crashed
 from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
 
-from flows.server import LOOPBACK, home, server
 from vinemap.compute.processes import STOPPING, descendants
 from vinemap.errors import ConfigError, VinemapError
+
+from .server import LOOPBACK, home, server
 
 if TYPE_CHECKING:
     from subprocess import Popen

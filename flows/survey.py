@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,24 +14,24 @@ from prefect.artifacts import create_table_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.states import Completed, Failed
 
-from flows.parcel import ensure_cloud
-from vinemap import paths
-from vinemap.cli.terminal import plain_errors
-from vinemap.config.surveys import SurveyConfig, load_estate, load_survey
-from vinemap.errors import ConfigError, VinemapError
-from vinemap.jobs.estate import arrivals
-from vinemap.jobs.plan import FAILED, Outcome
+from vinemap.errors import VinemapError
+from vinemap.example import ensure_cloud
+from vinemap.jobs.configured import chosen
+from vinemap.jobs.plan import COLUMNS, FAILED, Outcome, in_table
 from vinemap.jobs.survey import map_survey
+from vinemap.terminal import plain_errors, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable
+    from pathlib import Path
 
     from prefect import State
     from prefect.client.schemas.objects import TaskRun
 
+    from vinemap.config.surveys import SurveyConfig
+
 RETRIES = (20, 60, 180)
 """Seconds after which what may heal is tried again."""
-COLUMNS = ("parcel", "rows", "seconds", "state", "reason")
 
 
 def as_task(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -73,24 +72,12 @@ def survey_flow(config: SurveyConfig, folder: Path, *, again: bool = False) -> S
         if sys.stderr.isatty():
             click.echo(outcome.line(), err=True)
     outcomes.sort(key=lambda outcome: outcome.parcel)
-    create_table_artifact([dict(zip(COLUMNS, row, strict=True)) for row in rows_of(outcomes)], key="survey")
+    create_table_artifact([dict(zip(COLUMNS, row, strict=True)) for row in in_table(outcomes)], key="survey")
     failed = [outcome.parcel for outcome in outcomes if outcome.state == FAILED]
     message = f"{len(outcomes)} parcels"
     if failed:
         return Failed(message=f"{len(failed)} of {message} failed: {', '.join(failed)[:200]}", data=outcomes)
     return Completed(message=message, data=outcomes)
-
-
-def rows_of(outcomes: Iterable[Outcome]) -> list[tuple[str, ...]]:
-    """Rows of a table of what became of parcels, in words."""
-    return [(o.parcel, str(o.rows), f"{o.seconds:.1f}", o.state, " ".join(o.reason.split())) for o in outcomes]
-
-
-def show(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table."""
-    widths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
-    for row in (columns, *rows):
-        click.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
 
 
 def outcomes_of(config: SurveyConfig, folder: Path, *, again: bool = False) -> list[Outcome]:
@@ -108,28 +95,6 @@ def outcomes_of(config: SurveyConfig, folder: Path, *, again: bool = False) -> l
     return list(outcomes)
 
 
-def chosen(survey: str) -> tuple[SurveyConfig, Path]:
-    """Configuration of a survey and the folder of its products, by the name of a file or of what has arrived.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such survey.
-    """
-    path = Path(survey) if survey.endswith((".yaml", ".yml")) else paths.configuration(survey)
-    if path.is_file() or not paths.ESTATE.is_file():
-        config = load_survey(path)
-        return config, paths.survey_products(config.survey)
-    estate = load_estate(paths.ESTATE)
-    found = {arrival.name: arrival for arrival in arrivals(estate)}
-    if survey not in found:
-        raise ConfigError(f"{path}: no such file, and nothing of that name in {estate.surveys}")
-    arrival = found[survey]
-    if not arrival.config:
-        raise ConfigError(f"{survey}: {arrival.reason}")
-    return arrival.config, estate.products / survey
-
-
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("survey")
 @click.option("--again", is_flag=True, help="Map parcels that are up to date, too.")
@@ -140,12 +105,7 @@ def command(survey: str, again: bool) -> None:
     """
     config, folder = chosen(survey)
     ensure_cloud(config)
-    outcomes = outcomes_of(config, folder, again=again)
-    show(COLUMNS, rows_of(outcomes))
-    failed = sum(outcome.state == FAILED for outcome in outcomes)
-    if failed:
-        click.echo(f"vinemap: {failed} of {len(outcomes)} parcels failed", err=True)
-        sys.exit(1)
+    tell(outcomes_of(config, folder, again=again))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from vinemap.compute.processes import descendants
 SERVE = """
 import json, sys
 from flows.serving import serve
-from vinemap.cli.terminal import plain_errors
+from vinemap.terminal import plain_errors
 with plain_errors():
     serve("job.job", **json.loads(sys.argv[1]))
 """

@@ -27,7 +27,7 @@ WORKS = """
 import json, os, sys, warnings
 from pathlib import Path
 warnings.simplefilter("ignore")
-from vinemap.cli.terminal import plain_errors
+from vinemap.terminal import plain_errors
 from vinemap.compute import machine
 from vinemap.compute.processes import run_process
 from vinemap.jobs.workers import Workers

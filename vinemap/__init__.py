@@ -8,9 +8,11 @@ What a notebook needs is here and loaded at its first use; everything else is im
     surfaces, rows, canopy        chapters 2 and 3 of the thesis, a stage a file
     evaluate, product, odometry   how good a map is; what a run leaves; chapter 4
     export, parcel, jobs          other programs' formats; the chain, once; many parcels and surveys
-    cli, simulate, measure        the command line; vineyards of known truth; accuracy and speed
+    terminal, simulate, example   what people see in one; vineyards of known truth; that which comes with vinemap
+    flows, cli, measure           the chain as flows of Prefect; the command line; accuracy and speed
 
-``flows`` hands the chain to Prefect. `tests/test_house.py` holds the order, docs/method.md is the map of the house.
+``flows`` lies beside this package in the repository, and within it where that is installed. `tests/test_house.py` holds
+the order, docs/method.md is the map of the house.
 """
 
 from importlib import import_module

@@ -23,6 +23,8 @@ PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
 INDEX = "index.html"
+SURVEYS, PRODUCTS = DATA / "surveys", DATA / "products"
+"""Folders of surveys and of what is made of them, where nobody says otherwise."""
 ESTATE = Path("configs/nightly.yaml")
 """Configuration of the estate whose surveys come night after night."""
 REGISTER = DATA / "register.gpkg"
@@ -35,11 +37,21 @@ QGIS_PROJECT = "project.qgs"
 """The project in a ``.qgz``."""
 MATERIALS, MODEL, MODEL_CONFIG = "vineyard.mtl", "model.sdf", "model.config"
 """Files of a model of Gazebo."""
-TABLE_2_1 = Path(__file__).parents[1] / "data" / "table_2_1.csv"
-"""The thesis's table of rows."""
+EXAMPLE = Path("configs/barolo.yaml")
+"""Configuration of the example."""
 WEB = Path(__file__).parent / "product" / "pages" / "web"
 PAGE_STYLE, PAGE_LICENCES = WEB / "dist" / "style.css", WEB / "dist" / "LICENSES.txt"
 """Style of pages, and the licences of what they bundle."""
+
+
+def _packed(path: Path) -> Path:
+    """A file of the repository, which lies within the package where that is installed."""
+    package = Path(__file__).parent
+    return next((there for folder in (package, package.parent) if (there := folder / path).is_file()), path)
+
+
+TABLE_2_1, PACKED_EXAMPLE = _packed(DATA / "table_2_1.csv"), _packed(EXAMPLE)
+"""The thesis's table of rows, and the example's configuration as it comes with the package."""
 
 
 def safe(name: str) -> str:
@@ -86,12 +98,12 @@ def shown(path: Path | str) -> str:
 
 def survey_cloud(survey: str) -> Path:
     """Cloud of a survey."""
-    return cloud(DATA / "surveys" / survey, survey)
+    return cloud(SURVEYS / survey, survey)
 
 
 def survey_boundaries(survey: str) -> Path:
     """Polygons of a survey's parcels."""
-    return boundaries(DATA / "surveys" / survey)
+    return boundaries(SURVEYS / survey)
 
 
 def cloud(folder: Path, survey: str) -> Path:
@@ -111,7 +123,7 @@ def truth(folder: Path) -> Path:
 
 def survey_products(survey: str) -> Path:
     """Folder of the products of a survey's parcels."""
-    return DATA / "products" / survey
+    return PRODUCTS / survey
 
 
 def prefect_home() -> Path:

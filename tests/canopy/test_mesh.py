@@ -1,13 +1,12 @@
 """Closed pieces from sections, their volume, and Open3D."""
 
-import builtins
-
 import numpy as np
 import pytest
 import trimesh
 from meshes import LEANING, NOTCHED, ORIGIN, SQUARE, along, area, closed
 
 from vinemap.canopy.mesh import Mesh, audit, loft, merge, volume
+from vinemap.compute import extras
 from vinemap.errors import DependencyError
 
 
@@ -84,18 +83,14 @@ def test_open3d_finds_pieces_watertight_and_broken_ones_not():
 
 @pytest.mark.parametrize("failure", [ImportError("No module named 'open3d'"), OSError("libusb-1.0.so.0: cannot open")])
 def test_without_open3d_the_error_says_what_to_install(monkeypatch, failure):
-    real = builtins.__import__
+    def fails(name):
+        raise failure
 
-    def fails(name, *args, **kwargs):
-        if name == "open3d":
-            raise failure
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", fails)
+    monkeypatch.setattr(extras, "import_module", fails)
     with pytest.raises(DependencyError) as caught:
         audit(Mesh(*loft(along(SQUARE))))
     message = str(caught.value)
     assert str(failure) in message
     assert "apt-get install libegl1 libgl1 libusb-1.0-0" in message
-    assert "pip install open3d-cpu" in message
+    assert "pip install 'vinemap[mesh]'" in message
     assert "\n" not in message

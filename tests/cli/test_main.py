@@ -121,7 +121,7 @@ def test_wrong_words(tmp_path):
 
 
 def test_faults_are_one_line_too(tmp_path):
-    code = "from vinemap.cli import terminal\nwith terminal.plain_errors():\n    raise ZeroDivisionError('oops')\n"
+    code = "from vinemap import terminal\nwith terminal.plain_errors():\n    raise ZeroDivisionError('oops')\n"
     environment = {k: v for k, v in os.environ.items() if k != "VINEMAP_TRACEBACK"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.errors import DependencyError
+from vinemap.compute.extras import load
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -169,12 +169,7 @@ def audit(mesh: Mesh) -> Audit:
     DependencyError
         If Open3D can't be loaded.
     """
-    try:
-        import open3d  # 1 s, 400 MB, and needs system libraries
-    except (ImportError, OSError) as error:
-        raise DependencyError(
-            f"Open3D can't be loaded ({error}): apt-get install libegl1 libgl1 libusb-1.0-0, or pip install open3d-cpu"
-        ) from error
+    open3d = load("open3d")  # 1 s, 400 MB, and needs system libraries
     middle = mesh.vertices.mean(axis=0) if len(mesh.vertices) else 0.0
     shape = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices - middle), open3d.utility.Vector3iVector(mesh.faces)

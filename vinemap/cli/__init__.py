@@ -1,1 +1,1 @@
-"""The command line, a command a file; `terminal.py` shows progress and says errors in a line."""
+"""The command line, a command a file, or a few that go together."""

@@ -6,14 +6,16 @@ import click
 
 from vinemap import __version__
 from vinemap.cli.config import config
+from vinemap.cli.doctor import doctor
+from vinemap.cli.estate import example, nightly, parcel
 from vinemap.cli.evaluate import evaluate
 from vinemap.cli.export import export
 from vinemap.cli.register import register
 from vinemap.cli.run import run
 from vinemap.cli.survey import survey
-from vinemap.cli.terminal import hushed, plain_errors
 from vinemap.cli.track import track
 from vinemap.cli.warm import warm
+from vinemap.terminal import hushed, plain_errors
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -22,7 +24,7 @@ def commands() -> None:
     """Vine rows and light canopy meshes from UAV point clouds."""
 
 
-for command in (run, survey, register, config, evaluate, export, track, warm):
+for command in (run, survey, parcel, nightly, register, config, evaluate, export, track, example, warm, doctor):
     commands.add_command(command)
 
 

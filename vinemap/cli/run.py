@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vinemap.cli.options import FILE, OriginParam
-from vinemap.cli.terminal import progress
+from vinemap.terminal import progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""``vinemap survey``: map many parcels of a cloud."""
+"""``vinemap survey``: map many parcels of a cloud, or of a configured survey."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
+from vinemap.cli.estate import map_configured
 from vinemap.cli.options import FILE, OriginParam
+from vinemap.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+GIVEN = {ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT}
+
 
 @click.command()
-@click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
-@click.option("--boundaries", type=FILE, required=True, help="Polygons of the parcels, named in one of their columns.")
+@click.argument("clouds", metavar="CLOUD... | NAME", nargs=-1, required=True, type=FILE)
+@click.option("--boundaries", type=FILE, help="Polygons of the parcels of CLOUD, named in one of their columns.")
 @click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")
 @click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
 @click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
@@ -35,7 +40,7 @@ if TYPE_CHECKING:
 @click.option("--scheduler", help="Address of the Dask scheduler, as tcp://host:8786.")
 def survey(
     clouds: tuple[Path, ...],
-    boundaries: Path,
+    boundaries: Path | None,
     rows: Path | None,
     rows_crs: str | None,
     vines: Path | None,
@@ -48,7 +53,14 @@ def survey(
     again: bool,
     **job: Any,
 ) -> None:
-    """Map many parcels of CLOUD (LAS, LAZ or COPC files, or folders) in one job; exit code 1 if one of them fails."""
+    """Map many parcels of CLOUD in one job, or those of a configured survey; exit code 1 if one of them fails.
+
+    CLOUD is LAS, LAZ or COPC files, or folders of such, and wants --boundaries. NAME is a survey that
+    configs/NAME.yaml describes, that has arrived under that name, or a .yaml file; with it goes --again alone.
+    """
+    if boundaries is None:
+        map_configured(_name(clouds), again=again)
+        return
     from vinemap import paths
     from vinemap.cloud.files import cloud_files
     from vinemap.config.surveys import load_settings, survey_config
@@ -76,3 +88,18 @@ def survey(
         click.echo(outcome.line(), err=outcome.state == FAILED)
     if failed:
         sys.exit(1)
+
+
+def _name(given: tuple[Path, ...]) -> str:
+    """Name of a configured survey, which no option describes."""
+    from vinemap.cloud.files import CLOUDS
+
+    name, context = str(given[0]), click.get_current_context()
+    if len(given) > 1 or given[0].suffix.lower() in CLOUDS:
+        raise ConfigError(f"{name}: clouds need the polygons of their parcels: give --boundaries")
+    for option in context.command.params:
+        if option.name not in {"clouds", "again"} and context.get_parameter_source(option.name or "") in GIVEN:
+            raise ConfigError(
+                f"{option.opts[0]} goes with clouds and --boundaries: of {name} its configuration says that"
+            )
+    return name

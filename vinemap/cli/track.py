@@ -8,7 +8,7 @@ import click
 
 from vinemap import paths
 from vinemap.cli.options import FILE, StartParam
-from vinemap.cli.terminal import frame_progress
+from vinemap.terminal import frame_progress
 
 if TYPE_CHECKING:
     from pathlib import Path

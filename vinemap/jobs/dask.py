@@ -6,7 +6,8 @@ import threading
 from typing import TYPE_CHECKING, Any, Self
 
 from vinemap.compute import machine
-from vinemap.errors import ConfigError, DependencyError, WorkerError
+from vinemap.compute.extras import load
+from vinemap.errors import ConfigError, WorkerError
 from vinemap.jobs.workers import Worker
 
 if TYPE_CHECKING:
@@ -41,12 +42,9 @@ class DaskWorkers:
     """
 
     def __init__(self, scheduler: str, *, memory: float | None = None) -> None:
+        distributed = load("distributed")
         try:
-            from distributed import Client
-        except ImportError as error:
-            raise DependencyError("Dask isn't installed: pip install 'vinemap[dask]'") from error
-        try:
-            self._client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+            self._client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ConfigError(f"no Dask scheduler answers at {scheduler}: is that its address?") from error
         try:

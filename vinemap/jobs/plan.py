@@ -56,6 +56,15 @@ class Outcome:
         return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
 
 
+COLUMNS = ("parcel", "rows", "seconds", "state", "reason")
+"""Of a table of what became of parcels."""
+
+
+def in_table(outcomes: Iterable[Outcome]) -> list[tuple[str, ...]]:
+    """Rows of that table, in words."""
+    return [(o.parcel, str(o.rows), f"{o.seconds:.1f}", o.state, " ".join(o.reason.split())) for o in outcomes]
+
+
 class Plan(NamedTuple):
     """What is to be done for a survey, and what is settled without."""
 

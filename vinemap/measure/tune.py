@@ -17,13 +17,13 @@ from scipy.optimize import differential_evolution
 
 from vinemap.canopy.numbers import modelling_indices
 from vinemap.cli.options import FILE
-from vinemap.cli.terminal import plain_errors
 from vinemap.cloud.las import read_cloud
 from vinemap.config.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.errors import InputError
 from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.crs import parse_crs
 from vinemap.parcel import map_rows, model_canopies
+from vinemap.terminal import plain_errors
 
 if TYPE_CHECKING:
     from vinemap.canopy.model import CanopyModel

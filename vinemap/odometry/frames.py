@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
+from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -118,8 +119,7 @@ def _quieten() -> None:
     """What is wrong with a frame is said in the track; decoders would add lines of their own."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", WHOLE)
-    import cv2
-
+    cv2 = load("cv2")
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,8 +46,10 @@ def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View
     ------
     InputError
         If it isn't grey, of 8 bits and of the camera's size.
+    DependencyError
+        If OpenCV can't be loaded.
     """
-    import cv2
+    cv2 = load("cv2")
 
     if image.ndim != 2 or image.dtype != np.uint8:
         raise InputError(f"A frame has shape {image.shape} of {image.dtype}: give grey images of 8 bits")

@@ -9,9 +9,9 @@ import click
 import yaml
 
 from vinemap import paths
-from vinemap.cli.terminal import frame_progress, plain_errors
 from vinemap.odometry.poses import Pose
 from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground, render, sinusoid
+from vinemap.terminal import frame_progress, plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

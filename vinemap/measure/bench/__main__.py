@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import click
 
 from vinemap.cli.options import FILE
-from vinemap.cli.terminal import plain_errors
 from vinemap.errors import ConfigError
 from vinemap.measure.bench.instead import instead, whole
 from vinemap.measure.bench.plot import draw
 from vinemap.measure.bench.runs import cold, many, measure, prefect
 from vinemap.measure.bench.tables import bar_table, dense_table, machine, stage_table, write_tables
 from vinemap.measure.tables import as_text
+from vinemap.terminal import plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from vinemap.cli.terminal import plain_errors
 from vinemap.errors import WorkerError
 from vinemap.jobs.workers import Workers
 from vinemap.measure.fuzz.damages import DAMAGES, write_wholes
 from vinemap.measure.fuzz.trial import DIED, FAULT, GOOD, HUNG, MEMORY_OUT, OUTCOMES, Verdict, Whole, examine, measure
 from vinemap.measure.tables import as_text
+from vinemap.terminal import plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

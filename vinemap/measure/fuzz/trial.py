@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vinemap import paths
-from vinemap.cli.terminal import hushed
 from vinemap.errors import BusyError, InputError, VinemapError
+from vinemap.terminal import hushed
 
 if TYPE_CHECKING:
     from collections.abc import Callable

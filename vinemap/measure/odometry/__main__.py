@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import click
 
 from vinemap.cli.options import FILE
-from vinemap.cli.terminal import plain_errors
 from vinemap.measure.odometry import plots
 from vinemap.measure.odometry.tables import (
     MOST_SECONDS,
@@ -38,6 +37,7 @@ from vinemap.measure.odometry.trials import (
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground
 from vinemap.simulate.steps import PATCH, walk
+from vinemap.terminal import plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -17,9 +17,11 @@ from vinemap.compute.processes import STOPPING
 from vinemap.errors import VinemapError, own_fault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from rich.progress import Progress, ProgressColumn
+
+    from vinemap.jobs.plan import Outcome
 
 T = TypeVar("T")
 
@@ -49,6 +51,23 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
             return function(*args, **kwargs)
 
         yield step
+
+
+def show(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    widths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
+    for row in (columns, *rows):
+        click.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
+
+
+def tell(outcomes: Sequence[Outcome]) -> None:
+    """Print what became of parcels, and end with exit code 1 if one failed."""
+    from vinemap.jobs.plan import COLUMNS, FAILED, in_table
+
+    show(COLUMNS, in_table(outcomes))
+    if failed := sum(outcome.state == FAILED for outcome in outcomes):
+        click.echo(f"vinemap: {failed} of {len(outcomes)} parcels failed", err=True)
+        sys.exit(1)
 
 
 def _bar(*columns: ProgressColumn) -> Progress:
