@@ -10,6 +10,7 @@ PACKAGE = Path(errors.__file__).parent
 DEVELOPERS = {"measure", "simulate"}
 """Rooms whose messages are for those who work on the software."""
 REMARKS = {
+    "cloud/formats/surface.py",
     "cloud/las_end.py",
     "errors.py",
     "evaluate/trunks.py",

@@ -13,7 +13,7 @@ from vinemap import paths
 from vinemap.canopy.classification import classify_points
 from vinemap.canopy.mesh import section_meshes
 from vinemap.canopy.model import CanopyModel, find_canopies, find_leaves, model_sections
-from vinemap.canopy.numbers import judge_canopies, summarise_rows
+from vinemap.canopy.numbers import as_seen, judge_canopies, summarise_rows
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
@@ -273,17 +273,18 @@ def follow(
         model, apart, high = model_canopies(found, settings, step=run), settings.sections.step, settings.cover.high
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
+        rows, table = as_seen(rows, model.table, tops=recipe.tops)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
         standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
         given = settings.missing.model_dump() | {"step": apart, "known": standing}
-        rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, model.table, found.cover, **given)
+        rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
         meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
         outlines = parcel_layer(parcel, rows, polygon, points)
         layers = {
             "rows": rows,
             "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
             "key_points": enhanced,
-            "sections": labelled(model.table, rows),
+            "sections": labelled(table, rows),
             "gaps": labelled(gaps, rows),
             "vines": labelled(vines, rows),
             "unmapped": run("Unmapped", find_unmapped, found.chm, rows, outlines if polygon else None, tallest=high),
@@ -320,8 +321,8 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., A
     """The points that a recipe asks for, in memory or in tiles beside the draft."""
     settings, collector = recipe.settings, _collector(recipe.settings, paths.tiles(draft))
     if piece:
-        return cast("Cloud", run("Reading", read_piece, piece, collector))
-    points: Cloud
+        points: Cloud = run("Reading", read_piece, piece, collector)
+        return points
     how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
     if settings.ground.engine == "pdal":
         points = run("Reading", read_cloud_pdal, recipe.clouds, **how)

@@ -1,12 +1,13 @@
-"""Names of files: the only place where one is written."""
+"""Names of files: the only place where one is written, which has as many lines as there are."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +20,8 @@ FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff
 """What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
 DEVICES = re.compile(r"(con(in\$|out\$)?|prn|aux|nul|(com|lpt)[\d¹²³]) *(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
+EPT = "ept.json"
+"""File that tells of Entwine Point Tiles, in their folder."""
 PIECES = ".pieces-"
 """How the name of a folder begins that holds the points of a survey's parcels while it is worked."""
 RUN = "run.json"
@@ -66,8 +69,16 @@ def _cut(name: str) -> str:
 
 
 def bare(cloud: Path) -> str:
-    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``)."""
-    return re.sub(r"\.copc$", "", cloud.stem, flags=re.IGNORECASE)
+    """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``); EPT is called as its folder."""
+    if cloud.name == EPT:
+        return cloud.absolute().parent.name
+    name = Path(urlsplit(url).path) if (url := url_of(cloud)) else cloud
+    return re.sub(r"\.copc$", "", name.stem, flags=re.IGNORECASE)
+
+
+def url_of(cloud: Path) -> str | None:
+    """Address of a cloud on a web server, of which a path has one slash less; None of a file."""
+    return str(Address(cloud.as_posix())) if cloud.parts[:1] in (("http:",), ("https:",)) else None
 
 
 def stem(cloud: Path) -> str:
@@ -82,7 +93,7 @@ def _plain(name: str) -> str:
 
 def named_by(clouds: Sequence[Path]) -> str:
     """What a survey is called after its files: a single one, or the folder that holds them all."""
-    folders = {cloud.resolve().parent for cloud in clouds}
+    folders = {cloud.resolve().parent.parent if cloud.name == EPT else cloud.resolve().parent for cloud in clouds}
     return stem(clouds[0]) if len(clouds) == 1 or len(folders) > 1 else _plain(folders.pop().name)
 
 
@@ -268,6 +279,30 @@ def gazebo_mesh(folder: Path, kind: str) -> Path:
 def gazebo_world(folder: Path, name: str) -> Path:
     """World of Gazebo in which a model stands."""
     return folder / f"{name}.sdf"
+
+
+def ept_folder(folder: Path, kind: str) -> Path:
+    """Where Entwine Point Tiles have their points ("data"), and the lists of their cubes ("hierarchy")."""
+    return folder / f"ept-{kind}"
+
+
+def ept_node(folder: Path, key: str, kind: str) -> Path:
+    """Points of one of their cubes ("laz", "bin")."""
+    return ept_folder(folder, "data") / f"{key}.{kind}"
+
+
+def ept_page(folder: Path, key: str) -> Path:
+    """A part of the list of their cubes."""
+    return ept_folder(folder, "hierarchy") / f"{key}.json"
+
+
+class Address(PurePosixPath):
+    """A path of a file on a web server, as people know it."""
+
+    def __str__(self) -> str:
+        """Address of the file."""
+        scheme, _, rest = super().__str__().partition(":/")
+        return f"{scheme}://{rest.lstrip('/')}"
 
 
 def piece(folder: Path, number: int) -> Path:

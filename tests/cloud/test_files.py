@@ -96,7 +96,7 @@ def test_folders_and_files(survey, tmp_path):
     assert paths.named_by(flights) == "flight 2026.05.12"
     assert paths.named_by([tmp_path / "may.5.COPC.laz"]) == "may.5"
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="empty: holds no LAS, LAZ or COPC file"):
+    with pytest.raises(InputError, match="empty: holds no cloud"):
         cloud_files(tmp_path / "empty")
     with pytest.raises(InputError, match="there is no cloud"):
         cloud_files([])

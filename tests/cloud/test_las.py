@@ -4,6 +4,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from lasfiles import write_copc
 from pyproj import CRS, Transformer
 
 from vinemap.cloud import copc, las
@@ -40,32 +41,6 @@ def test_reads_las_and_laz(tmp_path, points, suffix):
     cloud = read_cloud(write_las(tmp_path / f"a.{suffix}", points))
     assert cloud.crs == UTM
     assert np.allclose(cloud.xyz, points, atol=0.0006)
-
-
-def write_copc(path, xyz, *, crs=UTM, scales=(0.001, 0.001, 0.001), levels=4, noise=(), withheld=()):
-    """Write points (n, 3) to nodes of an octree of so many levels, chosen at random."""
-    copclib = pytest.importorskip("copclib", reason="copclib, which writes COPC files, is not on this machine")
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    middle, half = (low + high) / 2, 0.50001 * np.ptp(xyz, axis=0).max()
-    config = copclib.CopcConfigWriter(7, copclib.Vector3(*scales), copclib.Vector3(*np.floor(low)), crs.to_wkt())
-    config.las_header.min, config.las_header.max = copclib.Vector3(*low), copclib.Vector3(*high)
-    info = config.copc_info
-    info.spacing, info.halfsize = 10, half
-    info.center_x, info.center_y, info.center_z = middle
-    writer = copclib.FileWriter(str(path), config)
-    level = np.random.default_rng(0).integers(0, levels, len(xyz))
-    place = (xyz - middle + half) / (2 * half) * 2.0 ** level[:, None]
-    keys = np.column_stack([level, place.astype(int)])
-    for key in np.unique(keys, axis=0):
-        node = copclib.Points(writer.copc_config.las_header)
-        for k in np.flatnonzero((keys == key).all(axis=1)):
-            point = node.CreatePoint()
-            point.x, point.y, point.z = xyz[k]
-            point.classification, point.withheld = 7 if k in noise else 2, k in withheld
-            node.AddPoint(point)
-        writer.AddNode(copclib.VoxelKey(*key.tolist()), node)
-    writer.Close()
-    return path
 
 
 def in_order(xyz):

@@ -47,8 +47,8 @@ def test_something_else_is_left_out(place, name):
     [
         ("may.zip", "unpack it"),
         ("may.tar.gz", "unpack it"),
-        ("may.e57", "save it as LAS or LAZ"),
-        ("may.PLY", "save it as LAS or LAZ"),
+        ("may.rcp", "save it as LAS or LAZ"),
+        ("may.PTX", "save it as LAS or LAZ"),
         ("may.zip.001", "unpack it"),
         ("may.ldr", "save it as LAS or LAZ"),
         ("may.laz.part", "is its upload over?"),

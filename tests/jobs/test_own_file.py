@@ -27,7 +27,7 @@ def test_its_own_file(clouds, place):
         ("cluod: a.laz", "unknown key cluod: did you mean 'cloud'?"),
         ("settle: 5", "unknown key settle"),
         ("cloud: b.laz", "b.laz: no such file"),
-        ("cloud: ../..", "holds no LAS, LAZ or COPC file"),
+        ("cloud: ../..", "holds no cloud"),
         ("cloud: [a.laz, b.laz]", "b.laz: no such file"),
         ("cloud: []", "holds no cloud"),
         ('cloud: "a\\0b.laz"', "no such file"),

@@ -227,6 +227,14 @@ def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     return rows.assign(**{name: means[name].to_numpy() for name in names}, volume_m3=volume.to_numpy())
 
 
+def as_seen(
+    rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, tops: bool
+) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
+    """Rows and sections without what isn't known where ``tops`` alone were seen: where foliage begins, and its wall."""
+    unknown = dict.fromkeys(("bottom_m", "lwa_m2_ha"), np.nan) if tops else {}
+    return rows.assign(**unknown), sections.assign(**unknown)
+
+
 def lengths_of(sections: gpd.GeoDataFrame, step: float) -> Values:
     """Metres of row (m,) for which each section stands."""
     position, row = sections["position_m"].to_numpy(), sections["row_id"].to_numpy()

@@ -49,7 +49,10 @@ def run(
     classified: bool,
     plain: bool,
 ) -> None:
-    """Map the rows and canopies in CLOUD: LAS, LAZ or COPC files, worked as one, or folders of such."""
+    """Map the rows and canopies in CLOUD: files or folders, worked as one.
+
+    They are LAS, LAZ, COPC (also as https://…), EPT, E57, PLY, PCD, XYZ or CSV, or a surface model as GeoTIFF.
+    """
     with _importing():
         from vinemap import paths
         from vinemap.cloud.files import cloud_files

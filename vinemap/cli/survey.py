@@ -55,7 +55,7 @@ def survey(
 ) -> None:
     """Map many parcels of CLOUD in one job, or those of a configured survey; exit code 1 if one of them fails.
 
-    CLOUD is LAS, LAZ or COPC files, or folders of such, and wants --boundaries. NAME is a survey that
+    CLOUD is files or folders, as of vinemap run, and wants --boundaries. NAME is a survey that
     configs/NAME.yaml describes, that has arrived under that name, or a .yaml file; with it goes --again alone.
     """
     if boundaries is None:

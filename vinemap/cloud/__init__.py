@@ -1,4 +1,4 @@
-"""Point clouds: LAS, LAZ and COPC read into metres of one CRS, clipped, in memory, in tiles or in pieces.
+"""Point clouds: files read into metres of one CRS, clipped, in memory, in tiles or in pieces.
 
-Another kind of cloud is read by a file of its own beside `las.py`.
+Another kind of cloud is read by a file of its own in `formats`.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinemap import paths
+from vinemap.cloud.formats.kinds import IN_FOLDERS, is_surface, kind_of
+from vinemap.cloud.formats.remote import Ranges
 from vinemap.cloud.las_end import begins_as_las, read_head
 from vinemap.errors import InputError
 
@@ -18,7 +21,8 @@ if TYPE_CHECKING:
 
     from vinemap.cloud.las_end import Head
 
-CLOUDS = (".las", ".laz")
+CLOUDS = (".las", ".laz", *IN_FOLDERS)
+"""How files end that are clouds wherever they lie; others, as text and surface models, are if they are named."""
 COPC = ".copc.laz"
 
 
@@ -39,30 +43,44 @@ def cloud_files(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
     """
     found: list[Path] = []
     for path in listed(clouds):
-        if not path.is_dir():
+        if not path.is_dir() or paths.url_of(path):
             found.append(path)
             continue
         try:
-            inside = [p for p in sorted(path.iterdir()) if is_cloud(p)]
+            inside = [p for p in (tiles_in(one) for one in (path, *sorted(path.iterdir()))) if is_cloud(p)]
         except OSError as error:
             raise InputError(f"{path}: can't be read ({error.strerror})") from error
         if not inside:
-            raise InputError(f"{path}: holds no LAS, LAZ or COPC file")
+            raise InputError(f"{path}: holds no cloud: name the file, if it is text or a surface model")
         found += inside
     if not found:
-        raise InputError("there is no cloud: name a LAS, LAZ or COPC file")
+        raise InputError("there is no cloud: name a file, or a folder of such")
     return once(found)
 
 
 def is_cloud(path: Path) -> bool:
     """Whether something is a cloud by its name, and neither a folder nor hidden."""
-    return path.suffix.lower() in CLOUDS and not path.name.startswith(".") and not path.is_dir()
+    named = path.suffix.lower() in CLOUDS or path.name == paths.EPT
+    return named and not path.name.startswith(".") and not path.is_dir()
+
+
+def tiles_in(path: Path) -> Path:
+    """The file that describes Entwine Point Tiles, where a path is their folder; else the path."""
+    with suppress(OSError):
+        if (inside := path / paths.EPT).is_file():
+            return inside
+    return path
+
+
+def shows_tops(clouds: Sequence[Path]) -> bool:
+    """Whether something of a cloud was seen from above alone, as in a surface model."""
+    return any(map(is_surface, clouds))
 
 
 def once(files: Sequence[Path]) -> tuple[Path, ...]:
     """Files without those that hold the points of another: by the same name, or by their number and box.
 
-    Of one name in several formats COPC goes before LAZ before LAS.
+    Of one name in several formats COPC goes before LAZ before LAS before all others.
 
     Raises
     ------
@@ -112,9 +130,12 @@ def date_of(path: Path) -> datetime | None:
     OSError
         If the file can't be read.
     """
-    with path.open("rb") as stream:
-        head = stream.read(94)
-    if len(head) < 94:
+    if kind_of(path) == "remote":
+        head = Ranges(path).beginning[:94]
+    else:
+        with path.open("rb") as stream:
+            head = stream.read(94)
+    if len(head) < 94 or not head.startswith(b"LASF"):
         return None
     day, year = struct.unpack("<HH", head[90:])
     return (
@@ -122,11 +143,12 @@ def date_of(path: Path) -> datetime | None:
     )
 
 
-def _rank(path: Path) -> tuple[bool, bool]:
-    return path.name.lower().endswith(COPC), path.suffix.lower() == ".laz"
+def _rank(path: Path) -> tuple[bool, bool, bool]:
+    kind = path.suffix.lower()
+    return path.name.lower().endswith(COPC), kind == ".laz", kind == ".las"
 
 
 def worded(files: Sequence[Path]) -> str:
     """Files as an error names them."""
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"{files[0]}{more}"
+    return f"{paths.url_of(files[0]) or files[0]}{more}"

@@ -12,6 +12,8 @@ import shapely
 
 from vinemap.cloud.copc import is_copc, points_about
 from vinemap.cloud.files import listed, worded
+from vinemap.cloud.formats.chunks import other_chunks
+from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
@@ -148,6 +150,10 @@ def _chunks_of(
 ) -> Generator[_Chunk]:
     """Usable points of files, one after the other, once their first ones were found to be where they can be."""
     for path in files:
+        if kind_of(path):
+            for xyz, source in other_chunks(path, crs, around, remarks):
+                yield _Chunk(xyz, source, path)
+            continue
         with opened(path, crs=crs) as (reader, source, layout):
             box = _small_box(reader.header, source, around) if around else None
             found = points_about(path, layout, box, _needed()) if box else None

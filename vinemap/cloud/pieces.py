@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import shapely
 
 from vinemap import paths
 from vinemap.cloud.files import listed
@@ -64,7 +65,10 @@ def split_cloud(
         If the folder is full.
     """
     files = listed(clouds)
-    with open_cloud(files, crs=crs) as (place, chunks):
+    with open_cloud(files, crs=crs, around=_all_of(boundaries) if any(map(paths.url_of, files)) else None) as (
+        place,
+        chunks,
+    ):
         pieces: list[Piece | InputError] = []
         polygons, drafts = [], []
         for number, boundary in enumerate(boundaries):
@@ -86,6 +90,12 @@ def split_cloud(
                 with drafts[k].open("ab") as stream:
                     stream.write(xyz[start[k] : start[k + 1]].data)
     return pieces
+
+
+def _all_of(boundaries: Sequence[Boundary]) -> Boundary | None:
+    """All polygons as one; None where they are in several CRSs."""
+    shapes, crs = zip(*boundaries, strict=True)
+    return (shapely.MultiPoint(shapely.get_coordinates(shapes)), crs[0]) if len(set(crs)) == 1 else None
 
 
 def read_piece(piece: Piece, collector: Collector) -> Cloud:

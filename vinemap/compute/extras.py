@@ -24,6 +24,7 @@ EXTRAS = {
     "open3d": Extra("mesh", "Open3D", "the check of meshes", ", and apt-get install libegl1 libgl1 libusb-1.0-0"),
     "cv2": Extra("track", "OpenCV", "visual odometry"),
     "distributed": Extra("dask", "Dask", "a cluster"),
+    "pye57": Extra("e57", "pye57", "reading E57"),
     "pyarrow": Extra("parquet", "pyarrow", "Parquet"),
 }
 """By the name of their module."""

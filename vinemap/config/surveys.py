@@ -97,7 +97,7 @@ class SurveyConfig(_Surveys):
     survey: Name = Field(description="name; its data lie in data/surveys/<survey>")
     cloud: Path | list[Path] | None = Field(
         None,
-        description="LAS, LAZ or COPC file, folder of such, or a list of both, worked as one; "
+        description="file or address of a cloud, folder of such, or a list of both, worked as one; "
         "data/surveys/<survey>/<survey>.laz by default",
     )
     simulate: Literal["barolo"] | None = Field(None, description="example to simulate where the cloud is missing")

@@ -7,7 +7,9 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import paths
-from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once
+from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once, tiles_in
+from vinemap.cloud.formats.identity import parts_of
+from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
 from vinemap.errors import InputError, VinemapError
@@ -35,7 +37,7 @@ UNUSABLE = {
         *(".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".lz4", ".001", ".z01"),
     ),
     "can't be read: save it as LAS or LAZ": (
-        *(".e57", ".ply", ".pts", ".ptx", ".xyz", ".pcd", ".rcp", ".rcs", ".fls", ".zfs", ".zlas", ".lsproj"),
+        *(".ptx", ".rcp", ".rcs", ".fls", ".zfs", ".zlas", ".lsproj"),
         *(".slpk", ".ldr", ".rdb", ".rxp"),
     ),
 }
@@ -80,7 +82,7 @@ class _Found(NamedTuple):
 
 
 def arrivals(estate: EstateConfig, *, now: float | None = None) -> Iterator[Arrival]:
-    """Look through an estate's folder: each LAS, LAZ or COPC file in it is a survey, and each folder that holds some.
+    """Look through an estate's folder: each cloud in it is a survey, and each folder that holds some.
 
     Files in one folder are worked as one: tiles, flights. What can't be used, but may be meant to be, is named. Names
     that begin with a dot are left out, as tools of upload choose them for what isn't whole.
@@ -177,11 +179,11 @@ def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConf
     used = [p for p in (*clouds, config.boundaries, config.rows, config.vines, own) if p]
     for file in used:
         _check(file)
-    age = now - max(p.stat().st_mtime for p in used)
+    age = now - max(part.stat().st_mtime for p in used if not paths.url_of(p) for part in parts_of(p))
     if 0 <= age < estate.settle:
         return Arrival(name, None, f"changed {age:.0f} s ago, waits until {estate.settle:.0f} s", waits=True)
     for cloud in clouds:
-        if lacks := unfinished(cloud):
+        if not kind_of(cloud) and (lacks := unfinished(cloud)):
             return Arrival(name, None, f"{cloud}: {lacks}: is its upload over?", waits=age < LATE)
     return Arrival(name, config)
 
@@ -199,14 +201,15 @@ def _found(files: Iterable[Path], folder: Path | None) -> _Found:
     if folder and not polygons:
         unusable |= {p: NO_POLYGONS for p in everything if p.suffix.lower() in OTHER_POLYGONS and p not in known}
     partial = [p for p in shown if p.suffix.lower() in PARTIAL]
-    clouds = once([p for p in everything if is_cloud(p)])
+    clouds = once([p for p in map(tiles_in, everything) if is_cloud(p)])
     deeper = _deeper(folder, DEEP[:1] if clouds else DEEP) if folder and not own else []
     return _Found(clouds, polygons, known[0] if known else None, own, unusable, partial, deeper)
 
 
 def _deeper(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """Folders in a folder that hold clouds."""
-    clouds = (path for pattern in patterns for path in folder.glob(pattern) if is_cloud(path))
+    tiles = {part for path in (folder, *folder.iterdir()) for part in parts_of(path / paths.EPT)}
+    clouds = (path for pattern in patterns for path in folder.glob(pattern) if is_cloud(path) and path not in tiles)
     shown = (path.parent for path in clouds if not any(p.startswith(".") for p in path.relative_to(folder).parts))
     return list(dict.fromkeys(shown))
 
@@ -249,7 +252,7 @@ def _unusable(path: Path) -> str | None:
 def _check(file: Path) -> None:
     if (shown := paths.shown(file)) != str(file):
         raise InputError(f"{shown}: its name isn't Unicode: rename it")
-    if not file.is_file():
+    if not (file.is_file() or paths.url_of(file)):
         raise InputError(f"{file}: no such file")
 
 

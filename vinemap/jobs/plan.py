@@ -16,7 +16,7 @@ from vinemap.geo.crs import is_local, parse_crs
 from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.lines import KnownRows, read_rows, rows_of
 from vinemap.jobs.register import Known, candidates_due, known_of
-from vinemap.product.recipe import VINES, Recipe, Source, flown, product_in, read_clouds, read_source, vines_of
+from vinemap.product.recipe import VINES, Recipe, Source, fit_for, flown, product_in, read_clouds, read_source, vines_of
 from vinemap.product.record import in_words
 from vinemap.product.store import write_whole
 
@@ -152,7 +152,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             clouds=files,
             sources=sources,
             boundary=boundary,
-            settings=own.settings,
+            settings=fit_for(own.settings, files),
             crs=crs,
             origin=own.origin,
             flown=date,

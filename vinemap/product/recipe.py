@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import shapely
 
 from vinemap import __version__, paths
-from vinemap.cloud.files import cloud_files, date_of
+from vinemap.cloud.files import cloud_files, date_of, shows_tops
+from vinemap.cloud.formats.identity import digest_of, stamp_of
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import points_near, read_parcel
@@ -99,16 +100,14 @@ def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
 def _digest(path: Path, stamp: tuple[int, ...]) -> str:
     """SHA-256 of a file, worked out once a process: a night's plan asks for it, and then its job."""
     del stamp
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return digest_of(path)
 
 
 def _stamp(path: Path) -> tuple[int, ...]:
     try:
-        stat = path.stat()
+        return stamp_of(path)
     except OSError as error:
         raise _unreadable(path, error) from error
-    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
 
 
 def _unreadable(path: Path, error: OSError) -> InputError | BusyError:
@@ -146,6 +145,11 @@ class Recipe(NamedTuple):
     def flights(self) -> tuple[Source, ...]:
         """The clouds' sources."""
         return self.sources[: len(self.clouds)]
+
+    @property
+    def tops(self) -> bool:
+        """Whether canopies were seen from above alone."""
+        return shows_tops(self.clouds)
 
     def check(self) -> None:
         """Make sure that the clouds are still the same; BusyError if they aren't."""
@@ -245,8 +249,15 @@ def recipe_of(
         points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), {parcel: polygon})[parcel]
         if len(points) == 0:
             raise InputError(f"{vines}: none of its vines stands in the parcel: is its CRS the right one?")
-    given = settings or Settings(), crs, origin, date, survey, remarks, known, points
+    given = fit_for(settings or Settings(), files), crs, origin, date, survey, remarks, known, points
     return Recipe(parcel, files, sources, polygon, *given)
+
+
+def fit_for(settings: Settings, clouds: Sequence[Path]) -> Settings:
+    """Settings for a cloud: where canopies were seen from above alone, their polygons stand on the soil."""
+    if not shows_tops(clouds):
+        return settings
+    return settings.model_copy(update={"polygon": settings.polygon.model_copy(update={"foot": "soil"})})
 
 
 def vines_of(points: gpd.GeoSeries, parcels: Mapping[str, Boundary | None]) -> dict[str, gpd.GeoSeries]:

@@ -24,6 +24,7 @@ from pystac.extensions.projection import ProjectionExtension
 
 from vinemap import __version__, paths
 from vinemap.cloud.files import CLOUDS
+from vinemap.cloud.formats.kinds import kind_of
 from vinemap.evaluate.unmapped import TALL
 from vinemap.geo.crs import WGS84, is_local, project
 from vinemap.product.store import write_whole
@@ -146,6 +147,8 @@ def _asset(path: Path, folder: Path, title: str | None, *, role: str = "data") -
 
 
 def _href(path: Path, folder: Path) -> str:
+    if url := paths.url_of(path):
+        return url
     try:
         relative = RESERVED.sub(lambda found: quote(found[0]), Path(os.path.relpath(path, folder)).as_posix())
     except ValueError:  # on another drive
@@ -216,7 +219,7 @@ def write_collection(
     extent = json.loads(shapely.to_geojson(shapely.box(*bbox)))
     item = pystac.Item(survey, extent, bbox, flown, {"title": f"Survey {survey}"})
     _collect(item, survey, _href(whole, folder))
-    clouds = [path for path, _ in sources if path.suffix.lower() in CLOUDS]
+    clouds = [path for path, _ in sources if path.suffix.lower() in CLOUDS or kind_of(path)]
     for path, known in sources:
         at = clouds.index(path) if path in clouds else -1
         key = "boundaries" if at < 0 else f"cloud_{at + 1}" if at else "cloud"

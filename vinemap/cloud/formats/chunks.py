@@ -1,0 +1,91 @@
+"""Points of clouds in whatever format, checked as those of LAS are."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from vinemap import paths
+from vinemap.cloud.formats.e57 import read_e57
+from vinemap.cloud.formats.ept import read_ept
+from vinemap.cloud.formats.kinds import kind_of
+from vinemap.cloud.formats.pcd import read_pcd
+from vinemap.cloud.formats.ply import read_ply
+from vinemap.cloud.formats.remote import read_remote
+from vinemap.cloud.formats.surface import read_surface
+from vinemap.cloud.formats.text import read_text
+from vinemap.cloud.formats.told import Header, reading
+from vinemap.errors import InputError
+from vinemap.geo.place import check_place, doubts_of
+from vinemap.geo.stated import crs_of, examined
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+    from pathlib import Path
+
+    from pyproj import CRS
+
+    from vinemap.cloud.formats.told import Points
+    from vinemap.compute.arrays import Floats
+    from vinemap.geo.boundaries import Boundary
+
+WHOLE = {"e57": read_e57, "ply": read_ply, "pcd": read_pcd, "text": read_text}
+PARTS = {"ept": read_ept, "surface": read_surface, "remote": read_remote}
+"""Formats of which only what lies about a polygon is read."""
+WORDS = {"text": "text", "surface": "GeoTIFF", "remote": "COPC"}
+"""What formats are called whose names aren't those of files."""
+
+
+def other_chunks(
+    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str]
+) -> Generator[tuple[Floats, CRS]]:
+    """Coordinates (n, 3) of a file's usable points, chunk by chunk, and their CRS; what is to be known is added.
+
+    Raises
+    ------
+    InputError
+        If the file can't be read whole, has no CRS, or coordinates that can't be right.
+    BusyError
+        If it can't be read now.
+    """
+    kind, named = kind_of(path) or "", _named(path)
+    if kind in WHOLE and not path.is_file():
+        raise InputError(f"{path}: no such file")
+    points = WHOLE[kind](path) if kind in WHOLE else PARTS[kind](path, crs, around)
+    with closing(points.chunks) as chunks, reading(path, WORDS.get(kind, kind.upper())):
+        first = next((chunk for chunk in chunks if len(chunk)), None)
+        if first is None and around is None:
+            raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+        if first is None:
+            return
+        header = _with_box(points, first)
+        source = crs_of(header, crs, named)
+        remarks += [*_checked(first, points, header, source, named, given=crs is not None), *points.remarks]
+        yield first, source
+        for chunk in chunks:
+            if len(chunk):
+                yield chunk, source
+
+
+def _named(path: Path) -> Path:
+    """A path as it is written in a sentence."""
+    return cast("Path", paths.Address(path.as_posix())) if paths.url_of(path) else path
+
+
+def _with_box(points: Points, first: Floats) -> Header:
+    """What a file tells of itself, with the box of its first points where it states none: whose CRS is asked for."""
+    header = points.header
+    if not isinstance(header, Header) or np.isfinite(header.mins[:2]).all():
+        return header
+    return Header(header.wkt, first.min(axis=0), first.max(axis=0), header.scales, len(first))
+
+
+def _checked(first: Floats, points: Points, header: Header, source: CRS, path: Path, *, given: bool) -> list[str]:
+    """What is to be known of where points are, in a sentence each."""
+    if points.steps:
+        return examined(first, header, source, path, given=given)
+    x, y = np.median(first[:, :2], axis=0).tolist()
+    check_place(source, x, y, str(path))
+    return doubts_of(source, x, y)

@@ -1,0 +1,71 @@
+"""What tells whether a cloud is still the same: of a file, of a folder of tiles, of a file on a web server."""
+
+from __future__ import annotations
+
+import hashlib
+from email.utils import parsedate_to_datetime
+from typing import TYPE_CHECKING
+
+from vinemap import paths
+from vinemap.cloud.formats.kinds import kind_of
+from vinemap.cloud.formats.remote import Ranges
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def stamp_of(path: Path) -> tuple[int, ...]:
+    """Bytes, times of change (ns), and a number, which stay while a cloud does; of all files of EPT.
+
+    Raises
+    ------
+    OSError
+        If it can't be read.
+    VinemapError
+        If a server doesn't give it.
+    """
+    if paths.url_of(path):
+        file = Ranges(path)
+        when = parsedate_to_datetime(file.modified).timestamp() if file.modified else 0
+        number = int.from_bytes(hashlib.sha256(file.tag.encode() + file.beginning).digest()[:7], "big")
+        return file.size, int(when * 1e9), 0, number
+    stats = [part.stat() for part in parts_of(path)]
+    return (
+        sum(stat.st_size for stat in stats),
+        max(stat.st_mtime_ns for stat in stats),
+        max(stat.st_ctime_ns for stat in stats),
+        stats[0].st_ino if len(stats) == 1 else len(stats),
+    )
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a cloud's content; of a file on a server, of what it tells of it, and of its beginning.
+
+    Raises
+    ------
+    OSError
+        If it can't be read.
+    VinemapError
+        If a server doesn't give it.
+    """
+    digest = hashlib.sha256()
+    if paths.url_of(path):
+        file = Ranges(path)
+        digest.update(f"{file.url} {file.size} {file.tag} {file.modified}".encode() + file.beginning)
+        return digest.hexdigest()
+    parts = parts_of(path)
+    for part in parts:
+        if len(parts) > 1:
+            digest.update(part.relative_to(path.parent).as_posix().encode())
+        with part.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def parts_of(path: Path) -> list[Path]:
+    """Files of a cloud, of which EPT has many."""
+    if kind_of(path) != "ept":
+        return [path]
+    folders = (paths.ept_folder(path.parent, kind) for kind in ("data", "hierarchy"))
+    return [path, *(part for folder in folders for part in sorted(folder.glob("*")) if part.is_file())]

@@ -1,0 +1,97 @@
+"""Surface models: a raster of the highest surface, as photogrammetry leaves it, each pixel a point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinemap.cloud.formats.box import box_about
+from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
+from vinemap.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+    from pathlib import Path
+
+    from pyproj import CRS
+
+    from vinemap.cloud.formats.box import Box
+    from vinemap.compute.arrays import Floats, Values
+    from vinemap.geo.boundaries import Boundary
+
+LOWEST, HIGHEST = -1_000.0, 30_000.0
+"""Metres or feet between which all land lies: what is beyond stands for nothing."""
+
+
+def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
+    """Open a surface model as GeoTIFF, or that part of it which lies about a polygon.
+
+    Raises
+    ------
+    InputError
+        If it is none, or is a photograph.
+    """
+    import rasterio
+    from rasterio.enums import ColorInterp
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    with reading(path, "GeoTIFF"), rasterio.open(path) as raster:
+        if raster.count - (ColorInterp.alpha in raster.colorinterp) != 1 or raster.dtypes[0] == "uint8":
+            raise InputError(f"{path}: is a photograph, or several rasters in one: give the surface model alone")
+        if raster.transform.is_identity:
+            raise InputError(f"{path}: has no place: export the surface model as GeoTIFF, with its coordinates")
+        corners = _placed(raster, np.array([0, 0, raster.height, raster.height]), np.array([0, raster.width] * 2))
+        header = Header(
+            raster.crs.to_wkt() if raster.crs else "",
+            np.append(corners.min(axis=0), np.nan),
+            np.append(corners.max(axis=0), np.nan),
+            point_count=raster.width * raster.height,
+        )
+    remark = (
+        f"{path.name} is a surface model, which shows canopies from above alone: their meshes reach down to the soil, "
+        "where foliage begins isn't known (bottom_m, lwa_m2_ha), and volumes are of what was seen"
+    )
+    return Points(header, _read(path, box_about(around, header, crs, path)), (remark,), steps=False)
+
+
+def _read(path: Path, box: Box) -> Generator[Floats]:
+    import rasterio
+
+    with rasterio.open(path) as raster:
+        first, last, left, right = _part(raster, box)
+    rows = max(1, CHUNK // max(1, right - left))
+    for row in range(first, last, rows):
+        yield _strip(path, row, min(rows, last - row), left, right - left)
+
+
+def _strip(path: Path, row: int, rows: int, column: int, columns: int) -> Floats:
+    """Points (n, 3) of some rows and columns; the file is opened for them, as GDAL keeps to the thread that did."""
+    import rasterio
+    from rasterio.windows import Window
+
+    window = Window(column, row, columns, rows)
+    with rasterio.open(path) as raster:
+        heights = raster.read(1, window=window).astype(float) * raster.scales[0] + raster.offsets[0]
+        seen = (raster.read_masks(1, window=window) > 0) & (heights > LOWEST) & (heights < HIGHEST)
+        i, j = np.nonzero(seen)
+        return usable(np.column_stack([_placed(raster, i + row + 0.5, j + column + 0.5), heights[i, j]]))
+
+
+def _placed(raster: Any, rows: Values, columns: Values) -> Floats:
+    """Coordinates (n, 2) of places in a raster."""
+    t = raster.transform
+    return np.column_stack([t.c + t.a * columns + t.b * rows, t.f + t.d * columns + t.e * rows])
+
+
+def _part(raster: Any, box: Box) -> tuple[int, int, int, int]:
+    """First and last + 1 of the rows and of the columns that meet a box."""
+    if not np.isfinite(box[0][:2]).all():
+        return 0, raster.height, 0, raster.width
+    (west, south), (east, north) = box[0][:2], box[1][:2]
+    t = raster.transform
+    away = np.array([[west, west, east, east], [south, north, south, north]]) - [[t.c], [t.f]]
+    columns, rows = np.linalg.solve([[t.a, t.b], [t.d, t.e]], away)
+    first, left = (max(0, int(np.floor(side.min()))) for side in (rows, columns))
+    return first, min(raster.height, int(rows.max()) + 1), left, min(raster.width, int(columns.max()) + 1)

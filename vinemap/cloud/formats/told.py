@@ -1,0 +1,139 @@
+"""What a file tells of its points, and what is said of one that can't be read."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from vinemap.errors import PASSING, BusyError, InputError, VinemapError
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from vinemap.compute.arrays import Floats
+
+CHUNK = 500_000
+"""Points that are read at once."""
+NOISE = (7, 18)
+"""ASPRS classes of points that are none of anything."""
+UNKNOWN = np.full(3, np.nan)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What is told of coordinates, as laspy tells it of LAS: see :mod:`vinemap.geo.stated`."""
+
+    wkt: str = ""
+    """CRS, in WKT or as ``EPSG:n``; empty if none is stated."""
+    mins: Floats = field(default_factory=lambda: UNKNOWN)
+    maxs: Floats = field(default_factory=lambda: UNKNOWN)
+    scales: Floats = field(default_factory=lambda: np.zeros(3))
+    point_count: int = 0
+    evlrs: tuple[()] = ()
+
+    @property
+    def vlrs(self) -> Header:
+        """The records, of which there is one."""
+        return self
+
+    @property
+    def string(self) -> str:
+        """WKT in that record; empty if the CRS can't be understood."""
+        crs = self.parse_crs()
+        return crs.to_wkt() if crs else ""
+
+    def get_by_id(self, name: str) -> list[Header]:
+        """Records that tell of coordinates."""
+        del name
+        return [self] if self.wkt else []
+
+    def parse_crs(self, *, prefer_wkt: bool = True) -> CRS | None:
+        """The CRS that is stated; None if that can't be understood."""
+        try:
+            return CRS.from_user_input(self.wkt) if self.wkt and prefer_wkt else None
+        except CRSError:
+            return None
+
+
+class Points(NamedTuple):
+    """Points of a file in its own CRS."""
+
+    header: Header
+    chunks: Generator[Floats]
+    """Coordinates (n, 3) that are numbers, without noise."""
+    remarks: tuple[str, ...] = ()
+    steps: bool = True
+    """Whether coordinates stored in steps mean that they are stored too coarsely."""
+
+
+@contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Say in a line what libraries raise of a file that they can't read."""
+    try:
+        yield
+    except (VinemapError, MemoryError):
+        raise
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except Exception as error:
+        reason = str(error).strip().split("\n")[0][:160] or type(error).__name__
+        if isinstance(error, OSError) and error.errno in PASSING:
+            raise BusyError(f"{path}: can't be read now ({reason}): try again") from error
+        raise InputError(f"{path}: can't be read as {kind} ({reason}): is it whole?") from error
+
+
+def usable(columns: NDArray[Any], classes: NDArray[Any] | None = None) -> Floats:
+    """Coordinates (n, 3) that are numbers, of points that aren't classified as noise."""
+    xyz = np.ascontiguousarray(columns, dtype=np.float64)
+    keep = np.isfinite(xyz).all(axis=1)
+    if classes is not None:
+        keep &= ~np.isin(classes, NOISE)
+    return xyz if keep.all() else xyz[keep]
+
+
+def is_class(name: str) -> bool:
+    """Whether a column of such a name holds classes of points."""
+    return name.lower().removeprefix("scalar_") in {"classification", "class"}
+
+
+def columns_of(records: NDArray[Any], names: tuple[str, ...]) -> Floats:
+    """Coordinates (n, 3) of records (n,) with fields for x, y and z, usable ones."""
+    classes = next((records[name] for name in records.dtype.names or () if is_class(name)), None)
+    return usable(np.column_stack([records[name] for name in names]), classes)
+
+
+def axes_in(names: tuple[str, ...], path: Path) -> tuple[str, str, str]:
+    """Which of a file's fields are x, y and z.
+
+    Raises
+    ------
+    InputError
+        If one isn't there.
+    """
+    lower = {name.lower(): name for name in reversed(names)}
+    if lacking := [axis for axis in "xyz" if axis not in lower]:
+        raise InputError(f"{path}: its points have no {lacking[0]}: export them with x, y and z")
+    return lower["x"], lower["y"], lower["z"]
+
+
+def needed() -> Any:
+    """What is decompressed of a point, where the format lets the rest be: not colours, intensities and times."""
+    from laspy import DecompressionSelection as Selection
+
+    return Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
+
+
+def usable_records(records: Any) -> Floats:
+    """Coordinates (n, 3) of the points that are numbers, and neither flagged as noise nor withheld."""
+    xyz = np.column_stack([np.asarray(column) for column in (records.x, records.y, records.z)])
+    held = np.asarray(records.withheld, dtype=bool)
+    classes = np.asarray(records.classification)
+    return usable(xyz[~held], classes[~held]) if held.any() else usable(xyz, classes)
