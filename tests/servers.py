@@ -71,7 +71,7 @@ def serving(folder, *, ranges=True, breaks=0, stalls=0, silence=1.0, good=1, ref
     server.silence, server.good, server.refusals, server.tag = silence, good, list(refusals), '"1"'
     server.sent = server.asked = 0
     server.url = f"http://127.0.0.1:{server.server_address[1]}"
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:
         yield server

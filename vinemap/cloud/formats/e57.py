@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
+from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable, whole_steps
 from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
@@ -66,7 +66,7 @@ def _scan(file: Any, head: Any, path: Path) -> Generator[Floats]:
                 xyz = xyz[data[flag][:n] == 0]
             if head.has_pose():
                 xyz = file.to_global(xyz, head.rotation, head.translation)
-            yield usable(xyz)
+            yield whole_steps(usable(xyz))
     finally:
         reader.close()
 

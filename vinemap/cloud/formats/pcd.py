@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.cloud.formats.told import CHUNK, Header, Points, axes_in, columns_of, reading, usable
+from vinemap.cloud.formats.told import CHUNK, Header, Points, axes_in, columns_of, reading, usable, whole_steps
 from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
@@ -45,7 +45,7 @@ def read_pcd(path: Path) -> Points:
     elif form == "binary":
         chunks = _packed(path, start, n, dtype, names)
     else:
-        chunks = _unpacked(path, n)
+        chunks = _unpacked(path, n, single=dtype[names[0]].itemsize == 4)
     return Points(Header(point_count=n), chunks)
 
 
@@ -106,7 +106,7 @@ def _width(field: np.dtype[Any]) -> int:
     return int(np.prod(field.shape, dtype=int))
 
 
-def _unpacked(path: Path, n: int) -> Generator[Floats]:
+def _unpacked(path: Path, n: int, *, single: bool) -> Generator[Floats]:
     """Points of a compressed file, whole, as Open3D unpacks it."""
     open3d = load("open3d")
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
@@ -114,4 +114,5 @@ def _unpacked(path: Path, n: int) -> Generator[Floats]:
     if len(xyz) == 0 < n:
         raise InputError(f"{path}: its packed points are damaged: copy or download it again")
     for first in range(0, len(xyz), CHUNK):
-        yield usable(xyz[first : first + CHUNK].copy())
+        part = usable(xyz[first : first + CHUNK].copy())
+        yield whole_steps(part) if single else part

@@ -24,6 +24,8 @@ CHUNK = 500_000
 """Points that are read at once."""
 NOISE = (7, 18)
 """ASPRS classes of points that are none of anything."""
+DECIMALS = 4
+"""Of coordinates that were kept in single precision: about a point near by, where they are right to so many."""
 UNKNOWN = np.full(3, np.nan)
 
 
@@ -99,6 +101,15 @@ def usable(columns: NDArray[Any], classes: NDArray[Any] | None = None) -> Floats
     return xyz if keep.all() else xyz[keep]
 
 
+def whole_steps(xyz: Floats) -> Floats:
+    """Coordinates (n, 3) as they were before they were written in single precision, which shifts them by microns.
+
+    Points lie on steps of a millimetre, mostly, and so do the edges of cells that are made of them: points on an edge
+    would go to either side.
+    """
+    return np.round(xyz, DECIMALS)
+
+
 def is_class(name: str) -> bool:
     """Whether a column of such a name holds classes of points."""
     return name.lower().removeprefix("scalar_") in {"classification", "class"}
@@ -107,7 +118,8 @@ def is_class(name: str) -> bool:
 def columns_of(records: NDArray[Any], names: tuple[str, ...]) -> Floats:
     """Coordinates (n, 3) of records (n,) with fields for x, y and z, usable ones."""
     classes = next((records[name] for name in records.dtype.names or () if is_class(name)), None)
-    return usable(np.column_stack([records[name] for name in names]), classes)
+    xyz = usable(np.column_stack([records[name] for name in names]), classes)
+    return whole_steps(xyz) if all(records.dtype[name].itemsize == 4 for name in names) else xyz
 
 
 def axes_in(names: tuple[str, ...], path: Path) -> tuple[str, str, str]:
