@@ -27,6 +27,10 @@ def call(*words, cwd):
     return subprocess.run(list(map(str, words)), cwd=cwd, env=environment, capture_output=True, text=True, check=False)
 
 
+def python_in(environment):
+    return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     """The wheel, built here where hatchling is installed, else as pip does it, which fetches that."""
@@ -44,7 +48,7 @@ def bare(wheel, tmp_path_factory):
     """Python of an environment that has the wheel and what this one has, but for the extras."""
     folder = tmp_path_factory.mktemp("bare")
     venv.create(folder / "venv")
-    python = folder / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    python = python_in(folder / "venv")
     done = call(
         sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", "--no-compile", wheel, cwd=folder
     )
@@ -106,7 +110,7 @@ def test_the_doctor_tells_what_is_there_and_what_is_not(bare, tmp_path):
 @pytest.mark.skipif(WHOLE not in os.environ, reason="takes minutes and a package index: make test-installed")
 def test_pip_installs_what_a_map_needs(wheel, tmp_path):
     venv.create(tmp_path / "venv", with_pip=True)
-    (python,) = (tmp_path / "venv").glob("*/python*[!0-9w]")
+    python = python_in(tmp_path / "venv")
     before = size(tmp_path / "venv")
     done = call(python, "-m", "pip", "install", "-q", "-c", ROOT / "configs" / "constraints.txt", wheel, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

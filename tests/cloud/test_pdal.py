@@ -396,3 +396,8 @@ def test_pdal_itself(tmp_path, vineyard):
     error = np.abs(sample(dtm, xy) - vineyard.terrain(*xy.T))
     assert np.median(error) < 0.02
     assert np.quantile(error, 0.95) < 0.12
+
+
+def test_other_formats_are_not_its_own(pdal):
+    with pytest.raises(InputError, match=r"a\.e57: ground\.engine: pdal reads LAS, LAZ and COPC on a disk alone"):
+        read_cloud_pdal([Path("b.laz"), Path("a.e57")])

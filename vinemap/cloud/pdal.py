@@ -14,6 +14,7 @@ import shapely
 
 from vinemap.cloud.copc import is_copc
 from vinemap.cloud.files import listed
+from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.las import OURS, collected, opened, unreadable
 from vinemap.cloud.tiles import Collector
 from vinemap.errors import DependencyError, InputError
@@ -97,6 +98,8 @@ def read_cloud_pdal(
     """
     load_pdal()
     files, collector, remarks = listed(clouds), Collector(), list[str]()
+    if other := next(filter(kind_of, files), None):
+        raise InputError(f"{other}: ground.engine: pdal reads LAS, LAZ and COPC on a disk alone: leave it out")
     place: Place | None = None
     for path in files:
         source, target, copc, more = _look_into(path, crs)
