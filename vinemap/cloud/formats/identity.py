@@ -48,19 +48,18 @@ def digest_of(path: Path) -> str:
     VinemapError
         If a server doesn't give it.
     """
-    digest = hashlib.sha256()
     if paths.url_of(path):
         file = Ranges(path)
-        digest.update(f"{file.url} {file.size} {file.tag} {file.modified}".encode() + file.beginning)
-        return digest.hexdigest()
-    parts = parts_of(path)
-    for part in parts:
-        if len(parts) > 1:
-            digest.update(part.relative_to(path.parent).as_posix().encode())
-        with part.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
+        told = f"{file.url} {file.size} {file.tag} {file.modified}".encode()
+        return hashlib.sha256(told + file.beginning).hexdigest()
+    first, *others = parts_of(path)
+    digests = [_sha256(first), *(f"{part.relative_to(path.parent).as_posix()} {_sha256(part)}" for part in others)]
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest() if others else digests[0]
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def parts_of(path: Path) -> list[Path]:
