@@ -26,6 +26,7 @@ ROOMS = [
     "product",
     "odometry",
     "export",
+    "chain",
     "parcel",
     "warm",
     "jobs",

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
+from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
-from vinemap.parcel import map_rows
 
 PLACE = np.array([500_000.0, 4_900_000.0])
 

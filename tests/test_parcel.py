@@ -15,6 +15,7 @@ import trimesh
 from click.testing import CliRunner
 
 from vinemap import paths
+from vinemap.chain import STAGES, call
 from vinemap.cli.main import commands
 from vinemap.config.settings import Settings
 from vinemap.errors import InputError, OutputError
@@ -22,7 +23,7 @@ from vinemap.evaluate.rows import evaluate_rows
 from vinemap.export.write import export_products
 from vinemap.geo.crs import LOCAL
 from vinemap.geo.main import Origin, main_to_wgs84
-from vinemap.parcel import STAGES, call, map_parcel
+from vinemap.parcel import map_parcel
 from vinemap.product.layers import LAYERS
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle

@@ -16,13 +16,14 @@ from scipy.spatial import cKDTree
 from vinemap import paths
 from vinemap.canopy.mesh import section_meshes, volume
 from vinemap.canopy.numbers import judge_canopies, modelling_indices, summarise_rows
+from vinemap.chain import RowMap, map_rows, model_canopies
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.evaluate.rows import evaluate_rows
 from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.main import Origin
-from vinemap.parcel import RowMap, map_parcel, map_rows, model_canopies
+from vinemap.parcel import map_parcel
 from vinemap.surfaces.ground import terrain_model
 
 ORIGIN = Origin(44.611669149, 7.924423195, 428.735)

@@ -19,12 +19,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from vinemap.chain import map_rows, model_canopies
     from vinemap.cloud.las import read_cloud
     from vinemap.config.settings import Settings
     from vinemap.evaluate.rows import evaluate_rows
     from vinemap.jobs.survey import map_survey
     from vinemap.odometry.step import estimate_motion
-    from vinemap.parcel import map_parcel, map_rows, model_canopies
+    from vinemap.parcel import map_parcel
 
 __version__ = "0.2.0"
 __all__ = [
@@ -43,9 +44,9 @@ _ROOMS = {
     "estimate_motion": "vinemap.odometry.step",
     "evaluate_rows": "vinemap.evaluate.rows",
     "map_parcel": "vinemap.parcel",
-    "map_rows": "vinemap.parcel",
+    "map_rows": "vinemap.chain",
     "map_survey": "vinemap.jobs.survey",
-    "model_canopies": "vinemap.parcel",
+    "model_canopies": "vinemap.chain",
     "read_cloud": "vinemap.cloud.las",
 }
 

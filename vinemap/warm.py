@@ -97,11 +97,11 @@ def find_canopies_of_none() -> None:
     import shapely
 
     from vinemap.canopy.model import find_canopies
+    from vinemap.chain import map_rows
     from vinemap.cloud.points import PointCloud
     from vinemap.config.settings import Settings
     from vinemap.geo.crs import parse_crs
     from vinemap.geo.zones import deal, zones_of
-    from vinemap.parcel import map_rows
 
     draw = np.random.default_rng(0)
     x, y = draw.uniform(0, LENGTH, POINTS), draw.uniform(-SPACING, ROWS * SPACING, POINTS)

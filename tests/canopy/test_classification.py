@@ -6,10 +6,10 @@ import pytest
 
 from vinemap.canopy.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
 from vinemap.canopy.model import find_canopies
+from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.write import write_classified
 from vinemap.config.settings import Settings
-from vinemap.parcel import map_rows
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from pyproj import CRS
 from systems import POSIX
 
 from vinemap import paths
+from vinemap.chain import call, map_rows, model_canopies
 from vinemap.cloud.las import collected
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector, TiledCloud
@@ -21,7 +22,7 @@ from vinemap.config.settings import ReadingOptions, Settings
 from vinemap.errors import InputError, OutputError
 from vinemap.geo.place import Place
 from vinemap.geo.raster import grid_over, squares, window
-from vinemap.parcel import call, map_parcel, map_rows, model_canopies
+from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb
 from vinemap.simulate.survey import write_survey
 from vinemap.surfaces.canopy_height import canopy_height_model

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import shapely
 
+from vinemap.chain import map_rows
 from vinemap.evaluate.shift import measure_shift
-from vinemap.parcel import map_rows
 from vinemap.product.notices import shift_notices
 from vinemap.simulate.scenes import rows_of
 

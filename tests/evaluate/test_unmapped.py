@@ -7,10 +7,10 @@ import shapely
 from pyproj import CRS
 
 from vinemap.canopy.numbers import summarise_rows
+from vinemap.chain import map_rows, model_canopies
 from vinemap.config.settings import Settings
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.geo.raster import Grid, Raster
-from vinemap.parcel import map_rows, model_canopies
 
 WEST, NORTH, WIDE, HIGH = 414_700.0, 4_940_760.0, 60.0, 40.0
 SPACING, WIDTH, HEIGHT = 2.5, 0.5, 1.9

@@ -7,12 +7,12 @@ import pytest
 import shapely
 
 from vinemap.canopy.numbers import lengths_of, summarise_rows
+from vinemap.chain import map_rows, model_canopies
 from vinemap.evaluate.planting import Edges, estimate_spacing, place_vines
 from vinemap.evaluate.shift import Shift
 from vinemap.evaluate.trunks import vines_in_rows
 from vinemap.evaluate.vines import find_vines
 from vinemap.geo.raster import Raster, grid_over
-from vinemap.parcel import map_rows, model_canopies
 
 STEP = 0.25
 ROWS_APART = 2.5

@@ -9,13 +9,13 @@ import shapely.ops
 from click.testing import CliRunner
 from commands import python
 
+from vinemap.chain import RowMap
 from vinemap.geo.raster import Grid, Raster
 from vinemap.measure.accuracy.__main__ import main
 from vinemap.measure.accuracy.family import measure
 from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, table
 from vinemap.measure.accuracy.rows import compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill
-from vinemap.parcel import RowMap
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate

@@ -8,8 +8,8 @@ import shapely
 from vinemap.canopy.model import CanopyModel
 from vinemap.canopy.numbers import measure_sections, tabulate_sections
 from vinemap.canopy.points import Sections
+from vinemap.chain import RowMap
 from vinemap.measure.accuracy.canopies import compare_canopies, pool_canopies
-from vinemap.parcel import RowMap
 from vinemap.simulate.plants import Vineyard, foliage_outlines
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate

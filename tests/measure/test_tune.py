@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from vinemap.chain import map_rows
 from vinemap.config.settings import Settings
 from vinemap.measure.tune import BOUNDS, main, reference_model, score, search, some_rows
-from vinemap.parcel import map_rows
 from vinemap.simulate.survey import write_survey
 
 

@@ -8,10 +8,10 @@ import pytest
 import shapely
 from shapely.ops import substring
 
+from vinemap.chain import map_rows
 from vinemap.config.settings import KnownRowOptions, Settings
 from vinemap.errors import InputError
 from vinemap.geo.raster import sample
-from vinemap.parcel import map_rows
 from vinemap.rows.ends import Known, Standing, cut_as_known
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.known import follow_lines, name_rows

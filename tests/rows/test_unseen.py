@@ -6,10 +6,10 @@ import pandas as pd
 import pytest
 import shapely
 
+from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import Grid, Raster
-from vinemap.parcel import map_rows
 from vinemap.rows.ends import (
     MISSING,
     OUTSIDE,

@@ -15,7 +15,6 @@ from vinemap.canopy.numbers import Measures, measure_sections, tabulate_sections
 from vinemap.canopy.peeling import peel_sections
 from vinemap.canopy.points import join
 from vinemap.canopy.sections import cut_sections
-from vinemap.compute import machine
 from vinemap.compute.threads import in_threads
 
 if TYPE_CHECKING:
@@ -97,7 +96,6 @@ def model_sections(
     at = join([model.at for model in models])
     polygons = np.concatenate([model.polygons for model in models])
     measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))
-    machine.give_back()
     return CanopyModel(at, polygons, tabulate_sections(at, polygons, measures, crs=crs))
 
 

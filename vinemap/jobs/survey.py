@@ -13,6 +13,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import paths
+from vinemap.chain import call
 from vinemap.cloud.files import worded
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
@@ -20,7 +21,7 @@ from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, 
 from vinemap.jobs.plan import DONE, FAILED, LEFT, OUTSIDE, Outcome, Plan, plan_survey, write_record
 from vinemap.jobs.register import is_due, note
 from vinemap.jobs.workers import Worker, Workers
-from vinemap.parcel import call, follow
+from vinemap.parcel import follow
 from vinemap.product.globe import survey_tileset
 from vinemap.product.pages.survey import write_index
 from vinemap.product.stac import write_collection

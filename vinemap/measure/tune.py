@@ -16,19 +16,19 @@ import shapely
 from scipy.optimize import differential_evolution
 
 from vinemap.canopy.numbers import modelling_indices
+from vinemap.chain import map_rows, model_canopies
 from vinemap.cli.options import FILE
 from vinemap.cloud.las import read_cloud
 from vinemap.config.settings import PolygonOptions, SectionOptions, Settings
 from vinemap.errors import InputError
 from vinemap.geo.boundaries import read_boundary
 from vinemap.geo.crs import parse_crs
-from vinemap.parcel import map_rows, model_canopies
 from vinemap.terminal import plain_errors
 
 if TYPE_CHECKING:
     from vinemap.canopy.model import CanopyModel
+    from vinemap.chain import RowMap
     from vinemap.compute.arrays import Flags, Values
-    from vinemap.parcel import RowMap
 
 BOUNDS = [(0.1, 1.0), (0.1, 2.0), (5, 11)]
 """The thesis's ranges of a and b, in metres, and of c."""

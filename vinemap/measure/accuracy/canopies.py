@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinemap.canopy.model import CanopyModel
+    from vinemap.chain import RowMap
     from vinemap.compute.arrays import Floats
-    from vinemap.parcel import RowMap
     from vinemap.simulate.plants import Foliage
     from vinemap.simulate.survey import Survey
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import PolygonOptions, Settings
 from vinemap.measure.accuracy.canopies import CanopyErrors, compare_canopies, pool_canopies
 from vinemap.measure.accuracy.pictures import draw
 from vinemap.measure.accuracy.rows import Errors, compare, pool
 from vinemap.measure.accuracy.trust import Trust, pool_trust, trust
-from vinemap.parcel import map_rows, model_canopies
 from vinemap.simulate.families import family
 
 if TYPE_CHECKING:

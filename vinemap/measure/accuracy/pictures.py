@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
+    from vinemap.chain import RowMap
     from vinemap.measure.accuracy.rows import Worst
-    from vinemap.parcel import RowMap
     from vinemap.simulate.survey import Survey
 
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import geopandas as gpd
     from numpy.typing import ArrayLike, NDArray
 
+    from vinemap.chain import RowMap
     from vinemap.compute.arrays import Flags, Floats
-    from vinemap.parcel import RowMap
     from vinemap.simulate.survey import Survey
     from vinemap.surfaces.waves import RowField
 

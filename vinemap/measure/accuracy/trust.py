@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from vinemap.canopy.model import CanopyModel
+    from vinemap.chain import RowMap
     from vinemap.compute.arrays import Flags, Floats
-    from vinemap.parcel import RowMap
 
 SURE, DOUBTFUL = 0.9, 0.5
 """Confidence of rows that are sure, and below which they are doubtful."""

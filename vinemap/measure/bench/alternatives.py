@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import shapely
     from numpy.typing import NDArray
 
+    from vinemap.chain import RowMap
     from vinemap.compute.arrays import Floats
     from vinemap.geo.raster import Raster
-    from vinemap.parcel import RowMap
 
 T = TypeVar("T")
 CANOPY = (0.5, 2.9)
@@ -169,8 +169,8 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
 
     from vinemap.canopy.cgon import enclose
     from vinemap.canopy.hull import hull
+    from vinemap.chain import model_canopies
     from vinemap.config.settings import PolygonOptions, Settings
-    from vinemap.parcel import model_canopies
 
     _, found = mapped(cloud, boundary)
     outlines = model_canopies(found, Settings(polygon=PolygonOptions(c=OUTLINE))).polygons
@@ -196,10 +196,10 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
 
 def mapped(cloud: str, boundary: str) -> tuple[Floats, RowMap]:
     """Points (n, 3) of a parcel, and its rows as they come."""
+    from vinemap.chain import map_rows
     from vinemap.cloud.las import read_cloud
     from vinemap.config.settings import Settings
     from vinemap.geo.boundaries import read_boundary
-    from vinemap.parcel import map_rows
 
     points = read_cloud(Path(cloud), boundary=read_boundary(Path(boundary)))
     return np.concatenate([part.xyz for part in points.parts()]), map_rows(points, Settings())
