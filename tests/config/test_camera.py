@@ -58,6 +58,8 @@ def test_a_file_of_a_camera(tmp_path):
         ({"width": 0}, "width = 0"),
         ({"width": 32.5}, "width = 32.5"),
         ({"cx": 500}, "lie outside of the image"),
+        ({"mask": [[[0, 0], [10, 0]]]}, "mask"),
+        ({"mask": [[[0, 0], [400, 0], [0, 90]]]}, "mask reaches beyond the image's 320 × 240 pixels"),
         ({"distortion": [0.1]}, "must be 4, 5 or 8 numbers"),
         ({"distortion": [50, 0, 0, 0]}, "distortion.0 = 50: input should be less than or equal to 2"),
         ({"hight": 245}, "unknown key hight: did you mean 'height'"),

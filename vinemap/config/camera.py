@@ -18,6 +18,7 @@ NARROWEST, WIDEST = 2.0, 150.0
 UNSQUARE = 0.02
 """How much the two focal lengths may differ, as a share: templates are turned in pixels."""
 Pixels = Annotated[int, Field(ge=32, le=20_000)]
+Corner = tuple[float, float]
 LensTerm = Annotated[float, Field(ge=-2, le=2)]
 
 
@@ -39,6 +40,10 @@ class Camera(Options):
     turned_deg: float = Field(
         0.0, ge=-360, le=360, description="from straight ahead anticlockwise to where the images' right edge is (°)"
     )
+    mask: tuple[Annotated[tuple[Corner, ...], Field(min_length=3)], ...] = Field(
+        (),
+        description="polygons of (column, row) in which images show no ground: parts of the robot, text; none: all do",
+    )
 
     @model_validator(mode="after")
     def _sees(self) -> Camera:
@@ -52,6 +57,9 @@ class Camera(Options):
             raise ValueError(f"cx, cy ({self.axis[0]:g}, {self.axis[1]:g}) lie outside of the image")
         if len(self.distortion) not in LENS_TERMS:
             raise ValueError(f"distortion {list(self.distortion)} must be 4, 5 or 8 numbers of OpenCV, or none")
+        corners = np.array([corner for polygon in self.mask for corner in polygon]).reshape(-1, 2)
+        if np.any((corners < -1) | (corners > [self.width, self.height])):
+            raise ValueError(f"mask reaches beyond the image's {self.width} × {self.height} pixels: give column, row")
         return self
 
     @property

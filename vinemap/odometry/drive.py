@@ -11,6 +11,7 @@ from vinemap import paths
 from vinemap.errors import InputError, OutputError
 from vinemap.geo.crs import WGS84, metric_crs
 from vinemap.geo.lines import read_lines
+from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers
 from vinemap.odometry.poses import STILL
@@ -106,7 +107,15 @@ def map_drive(
 
     def followed() -> list[Fix]:
         frames = show(source.frames, source.n_frames)
-        return list(follow(frames, camera=camera, template_share=template_share, angles=angles, method=method))
+        told = follow(
+            frames,
+            camera=camera,
+            template_share=template_share,
+            angles=angles,
+            method=method,
+            foresight=MEMORY,
+        )
+        return list(told)
 
     def placed(fixes: list[Fix]) -> dict[str, gpd.GeoDataFrame]:
         layers = track_layers(fixes, start=start, crs=crs)

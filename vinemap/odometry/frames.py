@@ -50,6 +50,12 @@ CONTAINERS = (b"RIFF", b"ftyp", b"\x1aE\xdf\xa3")
 """What other files begin with that have such a name."""
 WHOLE = "ignore_editlist;1"
 """What decoders are told: to leave no frame out that a container says is none of the film."""
+NOISE, NOISE_AT_ONCE = 1, 3
+"""Grey levels by which nearly no pixel of a frame differs from its repetition; the latter if both have one time."""
+ALIKE = 0.95
+"""Share of pixels that are nearly all. Noise of a sensor, half a level at least, changes more."""
+EXPOSED = 16, 250
+"""Grey levels between which pixels have noise."""
 EPOCH = re.compile(r"(?<!\d)(1\d{9})(?:\.(\d{1,9})|(\d{3}|\d{6}|\d{9}))?(?!\d)")
 """Seconds since 1970 in a file's name, with decimals or as milli-, micro- or nanoseconds."""
 CLOCK = re.compile(r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)[T_ -]?([0-2]\d)[:-]?([0-5]\d)[:-]?([0-5]\d)[._,-]?(\d{1,9})?")
@@ -113,6 +119,21 @@ def time_of(name: str) -> float | None:
             return None
         return date.timestamp() + float(f"0.{decimals or 0}")
     return None
+
+
+def repeats(frame: Frame, next_frame: Frame) -> bool:
+    """Whether a recorder wrote a frame again: a camera that stands still takes another, whose noise is its own."""
+    a, b = frame.image, next_frame.image
+    if a is None or b is None or a.shape != b.shape:
+        return False
+    at_once = frame.time is not None and frame.time == next_frame.time
+    exposed = (b > EXPOSED[0]) & (b < EXPOSED[1])
+    if not exposed.any():
+        return False
+    import cv2
+
+    differ = cv2.absdiff(a, b)[exposed]
+    return bool(np.mean(differ <= (NOISE_AT_ONCE if at_once else NOISE)) > ALIKE)
 
 
 def _quieten() -> None:

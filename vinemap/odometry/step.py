@@ -12,13 +12,14 @@ import numpy as np
 
 from vinemap.errors import InputError
 from vinemap.odometry.correlation import COARSE_STEP, Place, Search, climb, coarse_peaks, peak, place_at, search_of
+from vinemap.odometry.field import cleaner_of
 from vinemap.odometry.judgement import agreement_at, doubt
 from vinemap.odometry.poses import Pose, onward
 from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 
 if TYPE_CHECKING:
-    from vinemap.compute.arrays import Image, Values
+    from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
 
 Strategy = Literal["coarse to fine", "exhaustive"]
@@ -30,6 +31,10 @@ APART = 1.5
 """Pixels of the coarse frames between two places that aren't the same."""
 SMALLEST_TEMPLATE = 5
 """Half width of a template in pixels."""
+ASIDE = 3
+"""Quarters of a template that it is put aside by at most, either way, where its place shows no ground."""
+LITTLE = 0.05
+"""Share of a template that may show no ground."""
 LARGEST_SHARE = 0.8
 """p_T above which nothing is left to move in."""
 
@@ -103,7 +108,8 @@ def estimate_motion(
     Chapter 4 of the thesis; G. D. Evangelidis and E. Z. Psarakis, Parametric image alignment using enhanced
     correlation coefficient maximization, IEEE TPAMI 30 (2008).
     """
-    a, b = (view_of(image, camera=camera, method=method) for image in (frame, next_frame))
+    cleaner = cleaner_of(None, camera)
+    a, b = (view_of(image, camera=camera, method=method, cleaner=cleaner) for image in (frame, next_frame))
     return motion_between(
         a,
         b,
@@ -137,7 +143,7 @@ def motion_between(
     half = round(template_share * shorter / 2)
     if not (angles[0] < angles[1] <= angles[0] + 360 and max(map(abs, angles)) <= 360):
         raise InputError(f"angles from {angles[0]:g}° to {angles[1]:g}° hold nothing: give the smaller first, in ±360")
-    centre = _template_centre(camera, half, expected)
+    centre = _template_centre(camera, half, expected, view.hidden)
     turned = expected.heading_deg if expected else 0.0
     fine = search_of(
         view.image,
@@ -184,12 +190,19 @@ def _next_middle(camera: Camera, movement: Pose) -> Values:
     return camera.pixel(there.x_mm, there.y_mm)
 
 
-def _template_centre(camera: Camera, half: int, expected: Pose | None) -> tuple[int, int]:
-    """Row and column of the template: the image's middle, or that of what both frames should show."""
+def _template_centre(camera: Camera, half: int, expected: Pose | None, hidden: Flags | None) -> tuple[int, int]:
+    """Row and column of the template: the image's middle, or that of what both frames should show, or ground beside."""
     middle = _middle(camera)
     then = _next_middle(camera, expected) if expected else middle
     room = np.array([camera.width, camera.height]) - 1 - half
-    column, row = np.clip(np.rint((middle + then) / 2), half, room).astype(int)
+    centre = np.clip(np.rint((middle + then) / 2), half, room).astype(int)
+    if hidden is None:
+        return int(centre[1]), int(centre[0])
+    aside = np.stack(np.meshgrid(*[np.arange(-ASIDE, ASIDE + 1) * half // 2] * 2), axis=-1).reshape(-1, 2)
+    places = np.clip(centre + aside, half, room)
+    covered = [hidden[r - half : r + half + 1 : 2, c - half : c + half + 1 : 2].mean() for c, r in places]
+    far = np.hypot(*(places - centre).T) / (half * ASIDE)
+    column, row = places[np.argmin(np.maximum(covered, LITTLE) + LITTLE * far)]
     return int(row), int(column)
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import chain, islice
 from typing import TYPE_CHECKING, NamedTuple
 
+from vinemap.odometry.field import cleaner_of, field_of, learned
+from vinemap.odometry.frames import repeats
 from vinemap.odometry.poses import STILL, Pose, moved, onward
 from vinemap.odometry.step import ANGLES, expected_overlap, motion_between
 from vinemap.odometry.views import LEAST_CONTRAST, view_of
@@ -56,6 +59,7 @@ def follow(
     angles: tuple[float, float] = ANGLES,
     method: Method = "aligned",
     keyframes: bool = True,
+    foresight: int = 0,
 ) -> Iterator[Fix]:
     """Follow a robot frame by frame, each pose told as soon as its frame is there.
 
@@ -67,11 +71,14 @@ def follow(
     Parameters
     ----------
     frames : iterable of Frame
-        Each looked at once, and no more than three of them are kept.
+        Each looked at once, and no more than four of them are kept, and those foreseen.
     camera, template_share, angles, method
         As for :func:`vinemap.odometry.step.estimate_motion`.
     keyframes : bool
         Whether frames are measured from keyframes, or each from the one before.
+    foresight : int
+        Frames that are looked at before the first pose is told, for what stays in them: dirt, text, shadows. Without
+        it, that is known after the first :data:`vinemap.odometry.field.FEWEST` of different ground.
 
     Raises
     ------
@@ -90,14 +97,22 @@ def follow(
             expected=expected,
         )
 
+    ahead = list(islice(frames := iter(frames), foresight))
+    field = field_of(frame.image for frame in ahead if frame.image is not None)
     key = last = lost = None
     pose, velocity = STILL, STILL
-    for number, frame in enumerate(frames):
+    shown: Frame | None = None
+    for number, frame in enumerate(chain(ahead, frames)):
         pose = onward(pose, velocity)
         if frame.image is None:
             yield _guess(frame, pose, frame.flaw)
             continue
-        view = view_of(frame.image, camera=camera, method=method)
+        if shown is not None and repeats(shown, frame):
+            yield _guess(frame, pose, "repeated")
+            continue
+        shown = frame
+        field = learned(field, frame.image)
+        view = view_of(frame.image, camera=camera, method=method, cleaner=cleaner_of(field, camera))
         if view.contrast < LEAST_CONTRAST:
             yield _guess(frame, pose, "blank")
             continue

@@ -10,7 +10,7 @@ from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
-    from vinemap.compute.arrays import Image, Values
+    from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
     from vinemap.odometry.refinement import Method
 
@@ -21,8 +21,18 @@ COARSE_SIZE = 60
 """Pixels along the shorter side of the coarse frames, or a little more or less."""
 BACKGROUND = 4.0
 """Sigma in pixels of the coarse frames of what is taken off as uneven light."""
+DARKEST = 0.3
+"""Light of a pixel, as a share, below which it is not brightened to its full contrast, as that of noise is."""
 LEAST_CONTRAST = 1.0
 """Standard deviation in grey levels below which a frame shows nothing."""
+
+
+class Cleaner(NamedTuple):
+    """What frames are divided by, and which pixels show no ground."""
+
+    light: Values
+    """As a share of the usual, (ny, nx)."""
+    hidden: Flags | None = None
 
 
 class View(NamedTuple):
@@ -37,9 +47,11 @@ class View(NamedTuple):
     """Standard deviation in grey levels."""
     sharpness: float
     """Its fine detail over its contrast."""
+    hidden: Flags | None = None
+    """Pixels that show no ground."""
 
 
-def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View:
+def view_of(image: Image, *, camera: Camera, method: Method = "aligned", cleaner: Cleaner | None = None) -> View:
     """Make a frame ready for :func:`vinemap.odometry.step.motion_between`.
 
     Raises
@@ -56,14 +68,14 @@ def view_of(image: Image, *, camera: Camera, method: Method = "aligned") -> View
     if image.shape != (camera.height, camera.width):
         size = f"{image.shape[1]} × {image.shape[0]}"
         raise InputError(f"A frame has {size} pixels, the camera {camera.width} × {camera.height}: give frames of one")
-    values = image.astype(np.float32)
+    values = cleaned(image, cleaner)
     sigma = SMOOTHING * max(1.0, min(image.shape) / SMOOTHED_SIZE)
     smooth = np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), np.float32)
-    coarse = _reduced(values)
+    coarse = reduced(values)
     contrast = float(values.std())
     sharpness = float(cv2.Laplacian(smooth, cv2.CV_32F).std()) / max(contrast, LEAST_CONTRAST)
     kept = values if method == "maximum" else smooth
-    return View(kept, coarse, coarse - cv2.GaussianBlur(coarse, (0, 0), BACKGROUND), contrast, sharpness)
+    return View(kept, coarse, detail_of(coarse), contrast, sharpness, cleaner and cleaner.hidden)
 
 
 def coarseness(image: Values) -> int:
@@ -72,11 +84,38 @@ def coarseness(image: Values) -> int:
     return max(1, round(shorter / COARSE_SIZE))
 
 
-def _reduced(image: Values) -> Values:
-    """Means of squares of pixels."""
+def reduced(image: Values) -> Values:
+    """A coarse frame: means of squares of pixels."""
     import cv2
 
     n = coarseness(image)
     height, width = (size // n for size in image.shape)
     whole = image[: height * n, : width * n]
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def detail_of(coarse: Values) -> Values:
+    """A coarse frame without uneven light."""
+    import cv2
+
+    return np.asarray(coarse - cv2.GaussianBlur(coarse, (0, 0), BACKGROUND))
+
+
+def cleaned(image: Image, cleaner: Cleaner | None) -> Values:
+    """A frame in grey levels without what stays; hidden pixels are filled from about them."""
+    import cv2
+
+    values = image.astype(np.float32)
+    if cleaner is None:
+        return values
+    light = cleaner.light
+    level = float(np.median(values[::4, ::4] / light[::4, ::4]))
+    values = np.asarray(level + (values / light - level) * np.minimum(light / DARKEST, 1), np.float32)
+    if cleaner.hidden is None:
+        return values
+    n = coarseness(values)
+    seen = (~cleaner.hidden).astype(np.float32)
+    weights, sums = (cv2.GaussianBlur(reduced(part), (0, 0), 2.0) for part in (seen, seen * values))
+    filled = (np.asarray(sums) + 1e-3 * level) / (np.asarray(weights) + 1e-3)
+    whole = cv2.resize(filled, values.shape[::-1], interpolation=cv2.INTER_LINEAR) if n > 1 else filled
+    return np.where(cleaner.hidden, whole, values).astype(np.float32)
