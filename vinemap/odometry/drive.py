@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import pyogrio
 import shapely
 
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 
+MOST_SUNK = 0.02
+"""Share of the camera's height by which it may change before that is said."""
+
 
 class DriveSummary(NamedTuple):
     """What became of a recording."""
@@ -45,6 +49,8 @@ class DriveSummary(NamedTuple):
     """How many poses have each flag."""
     length_m: float
     n_stretches: int
+    sunk: float = 0.0
+    """Share of its height by which the camera came closer to the ground than its file says, at most."""
 
     def line(self) -> str:
         """The same in one line."""
@@ -56,6 +62,8 @@ class DriveSummary(NamedTuple):
             said.append(f"{sum(self.flags.values())} flagged ({reasons})")
         if self.n_stretches > 1:
             said.append(f"in {self.n_stretches} stretches that nothing joins")
+        if abs(self.sunk) > MOST_SUNK:
+            said.append(f"ground came {100 * self.sunk:.0f}% closer than above_ground_mm: distances are as wrong there")
         return "; ".join(said)
 
 
@@ -124,7 +132,7 @@ def map_drive(
         return layers | {"poses": beside_rows(layers["poses"], lines)}
 
     if lines is not None:
-        placed([Fix("", None, STILL, 0.0, 0.0, 0.0, "", None)])  # whether start and rows go together
+        placed([Fix("", None, STILL, np.zeros((3, 3)), camera.above_ground_mm)])  # whether start and rows go together
     fixes = step(STAGES[0], followed)
     _check_fixes(fixes, recording, camera)
     layers = step(STAGES[1], placed, fixes)
@@ -137,6 +145,7 @@ def map_drive(
         flags={flag: flags.count(flag) for flag in set(flags)},
         length_m=float(layers["track"]["length_m"].sum()),
         n_stretches=len(layers["track"]),
+        sunk=max((1 - fix.height_mm / camera.above_ground_mm for fix in fixes), key=abs),
     )
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vinemap.odometry.correlation import Place, warp
-from vinemap.odometry.views import View, coarseness
+from vinemap.odometry.views import View, coarseness, fineness
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vinemap.compute.arrays import Values
+    from vinemap.compute.arrays import Flags, Values
 
 LEAST_OVERLAP = 0.1
 """Share of a frame that the next one must show too."""
@@ -34,6 +34,144 @@ FAINT = 1.0
 """Grey levels of detail that count as none."""
 NEAR_STILL = 3.0
 """Pixels of coarse frames within which what moves with the camera draws a step to where nothing moves."""
+
+PATCHES, PATCH_HALF, PATCH_REACH = 5, 12, 6
+"""Patches of fine detail along either side of what both frames show, their half width in pixels of some 320 × 240, and
+how far from where they should be they are looked for."""
+PATCH_SCORE, PATCH_SPREAD = 0.6, 3.0
+"""Correlation of a patch that agrees, and pixels from the others' median that it may lie off."""
+LEAST_PATCHES, FEWEST_PATCHES = 0.4, 3
+"""Share and number of patches that must agree."""
+
+MOST_UNSURE = 1.5, np.radians(0.4)
+"""Standard deviations in pixels and radians of a step from which on the ground isn't flat enough."""
+PLANE = 0.5
+"""Share of the patches' disagreement that is left if it is that of a plane that is tilted."""
+SHORT = 12.0
+"""Pixels of movement below which parallax says nothing of a tilt."""
+LEAST_SPREAD = 0.015
+"""Pixels by which patches disagree at least."""
+
+
+class Patches(NamedTuple):
+    """Pieces of fine detail of the next frame, and how they lie beside where a step puts them."""
+
+    places: Values
+    """Columns and rows (n, 2) in the next frame."""
+    shifts: Values
+    """Pixels (n, 2) from there to where they are."""
+    scores: Values
+    """Correlation there (n,)."""
+
+    @property
+    def agree(self) -> Flags:
+        """Which of them (n,) show the same ground, and lie together."""
+        same = self.scores > PATCH_SCORE
+        if not same.any():
+            return np.asarray(same)
+        off = self.shifts - np.median(self.shifts[same], axis=0)
+        return np.asarray(same & (np.hypot(*off.T) < PATCH_SPREAD))
+
+    @property
+    def mean(self) -> float:
+        """Mean correlation."""
+        return float(self.scores.mean()) if len(self.scores) else 0.0
+
+    @property
+    def fit(self) -> bool:
+        """Whether enough of them agree; unknown counts as such."""
+        n = len(self.scores)
+        return n < FEWEST_PATCHES or int(self.agree.sum()) >= max(FEWEST_PATCHES, LEAST_PATCHES * n)
+
+
+class Fit(NamedTuple):
+    """How patches lie together beside where a step puts them."""
+
+    shift: Values
+    """Of the step's place, columns and rows (2,)."""
+    turn: float
+    """Radians, clockwise in the image."""
+    covariance: Values
+    """Of shift and turn (3, 3), by how much the patches disagree."""
+    scale: float
+    """How much larger the next frame shows the ground."""
+    slope: Values | None
+    """The ground's to the right and downward (2,), as what is higher moves further; none of short steps."""
+    spread: float
+    """Pixels, root mean square along an axis, by which they disagree with one movement."""
+    rest: float
+    """The same if the camera may sink and tilt."""
+
+    def corrected(self, place: Place) -> Place:
+        """The place of the step that the patches tell."""
+        column, row = self.shift
+        return Place(place.angle + float(np.degrees(self.turn)), place.row + float(row), place.column + float(column))
+
+
+def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float) -> Fit | None:
+    """Fit a movement to patches that agree, and a plane of any tilt at another height; none if they are too few.
+
+    Parameters
+    ----------
+    place, centre
+        Where the template is in the next frame, and was in the first.
+    focal : float
+        Focal length in pixels.
+    """
+    agree = patches.agree
+    if agree.sum() < 2 * FEWEST_PATCHES:
+        return None
+    x, y = (patches.places[agree] - [place.column, place.row]).T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    far = np.array([place.column - centre[1], place.row - centre[0]]) / focal
+    rigid = np.concatenate([np.column_stack([one, none, -y]), np.column_stack([none, one, x])])
+    bent = np.concatenate([np.column_stack([x, far[0] * x, far[0] * y]), np.column_stack([y, far[1] * x, far[1] * y])])
+    shifts = patches.shifts[agree].T.ravel()
+    moved, _, _, _ = np.linalg.lstsq(rigid, shifts)
+    left = shifts - rigid @ moved
+    spread = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
+    whole = np.hstack([rigid, bent])
+    every, _, _, _ = np.linalg.lstsq(whole, shifts)
+    rest = float(np.sqrt(np.sum((shifts - whole @ every) ** 2) / max(len(left) - 6, 1)))
+    covariance = max(spread, LEAST_SPREAD) ** 2 * np.linalg.inv(rigid.T @ rigid)
+    slope = every[4:] if np.hypot(*far) * focal > SHORT else None
+    return Fit(moved[:2], float(moved[2]), covariance, float(every[3]), slope, spread, rest)
+
+
+def patches_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> Patches:
+    """Where patches of what two frames both show lie, by a movement."""
+    import cv2
+
+    a, b = view.fine, next_view.fine
+    n = fineness(view.image)
+    matrix = warp(place.angle, *((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:])))
+    moved = np.asarray(cv2.warpAffine(a, matrix, b.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+    half, far = PATCH_HALF, PATCH_HALF + PATCH_REACH
+    size = np.array(b.shape[::-1])
+    corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (size - 1) - matrix[:, 2]) @ matrix[:, :2]
+    low = np.maximum(corners.min(axis=0) + half, far)
+    high = np.minimum(corners.max(axis=0) - half, size - 1 - far)
+    if np.any(high < low):
+        return Patches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+    grid = np.rint(np.stack(np.meshgrid(*np.linspace(low, high, PATCHES).T), axis=-1).reshape(-1, 2))
+    there = grid @ matrix[:, :2].T + matrix[:, 2]
+    grid = grid[np.all((there > half + 2) & (there < size - 3 - half), axis=1)].astype(int)
+    shifts, scores = np.zeros((len(grid), 2)), np.zeros(len(grid))
+    for k, (x, y) in enumerate(grid):
+        part = b[y - far : y + far + 1, x - far : x + far + 1]
+        own = moved[y - half : y + half + 1, x - half : x + half + 1]
+        found = np.asarray(cv2.matchTemplate(part, own, cv2.TM_CCOEFF_NORMED), np.float32)
+        _, scores[k], _, (j, i) = cv2.minMaxLoc(found)
+        shifts[k] = [_vertex(found[i, :], j) - PATCH_REACH, _vertex(found[:, j], i) - PATCH_REACH]
+    return Patches((grid + 0.5) * n - 0.5, shifts * n, scores)
+
+
+def _vertex(values: Values, at: int) -> float:
+    """Place of the highest point of the parabola through a peak and its neighbours."""
+    if not 0 < at < len(values) - 1:
+        return float(at)
+    left, top, right = map(float, values[at - 1 : at + 2])
+    return at + (left - right) / (2 * (left - 2 * top + right)) if left + right < 2 * top else float(at)
 
 
 def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> tuple[float, float]:
@@ -64,7 +202,15 @@ def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Pl
 
 
 def doubt(
-    view: View, next_view: View, at_limits: Sequence[bool], *, score: float, agreement: float, rival: float
+    view: View,
+    next_view: View,
+    at_limits: Sequence[bool],
+    *,
+    score: float,
+    agreement: float,
+    rival: float,
+    patches: Patches,
+    fit: Fit | None,
 ) -> str:
     """Why a step isn't to be believed, in a word; empty if it is.
 
@@ -76,13 +222,19 @@ def doubt(
         Whether its turn, row and column lie where the search ends.
     score, agreement, rival : float
         Correlation of the template, of all that both frames show, and of the next best place.
+    patches, fit : Patches, Fit
+        What pieces of the frames say, one by one and together.
     """
     turned, *out = at_limits
+    place_sd, turn_sd = np.sqrt(np.diag(fit.covariance))[1:] if fit else (0.0, 0.0)
+    crooked = place_sd > MOST_UNSURE[0] or turn_sd > MOST_UNSURE[1]
     doubts = {
         "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
         "overlap": any(out),
-        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT,
-        "repeats": rival > MOST_RIVAL * agreement,
+        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT or not patches.fit,
+        "ambiguous": rival > MOST_RIVAL * agreement,
+        "tilt": crooked and fit is not None and fit.rest < PLANE * fit.spread,
+        "relief": crooked,
         "step": turned,
     }
     return next((reason for reason, doubted in doubts.items() if doubted), "")

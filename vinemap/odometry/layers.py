@@ -44,7 +44,9 @@ TRACK_LAYERS: dict[str, Layer] = {
     "poses": Layer(
         "Point",
         {"pose": WHOLE, "frame": TEXT, "time": TIME, "seconds": REAL}
-        | dict.fromkeys(("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap"), REAL)
+        | dict.fromkeys(
+            ("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap", "height_mm", "tilt_deg"), REAL
+        )
         | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
         | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
         "Poses of the robot, one a frame",
@@ -84,9 +86,11 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
             "heading_deg": (90.0 - heading) % 360,
             "lat": lat,
             "lon": lon,
-            "score": [fix.score for fix in fixes],
-            "agreement": [fix.agreement for fix in fixes],
-            "overlap": [fix.overlap for fix in fixes],
+            "score": [fix.motion.score if fix.motion else 0.0 for fix in fixes],
+            "agreement": [fix.motion.agreement if fix.motion else 0.0 for fix in fixes],
+            "overlap": [fix.motion.overlap if fix.motion else 0.0 for fix in fixes],
+            "height_mm": [fix.height_mm for fix in fixes],
+            "tilt_deg": [fix.motion.tilt_deg if fix.motion else np.nan for fix in fixes],
             "flag": [fix.flag for fix in fixes],
             "measured_from": [0 if fix.measured_from is None else fix.measured_from + 1 for fix in fixes],
             "stretch": stretches(fixes),

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 from math import cos, radians, sin
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vinemap.compute.arrays import Values
 
 
 class Pose(NamedTuple):
@@ -33,3 +38,12 @@ def onward(pose: Pose, movement: Pose) -> Pose:
     c, s = cos(radians(pose.heading_deg)), sin(radians(pose.heading_deg))
     dx, dy, turn = movement
     return Pose(pose.x_mm + dx * c - dy * s, pose.y_mm + dx * s + dy * c, pose.heading_deg + turn)
+
+
+def onward_covariance(pose: Pose, covariance: Values, movement: Pose, of_movement: Values) -> Values:
+    """Covariance (3, 3) in mm and degrees of the pose after a movement, from that of the pose and of the movement."""
+    c, s = cos(radians(pose.heading_deg)), sin(radians(pose.heading_deg))
+    dx, dy, _ = movement
+    of_pose = np.array([[1, 0, -radians(dx * s + dy * c)], [0, 1, radians(dx * c - dy * s)], [0, 0, 1]])
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return np.asarray(of_pose @ covariance @ of_pose.T + turn @ of_movement @ turn.T)

@@ -13,14 +13,18 @@ import numpy as np
 from vinemap.errors import InputError
 from vinemap.odometry.correlation import COARSE_STEP, Place, Search, climb, coarse_peaks, peak, place_at, search_of
 from vinemap.odometry.field import cleaner_of
-from vinemap.odometry.judgement import agreement_at, doubt
-from vinemap.odometry.poses import Pose, onward
+from vinemap.odometry.judgement import MOST_RIVAL, agreement_at, doubt, fit_of, patches_at
+from vinemap.odometry.poses import Pose, moved, onward
 from vinemap.odometry.refinement import Method, refine
-from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
+from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, fineness, view_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
+    from vinemap.odometry.correlation import Index
+    from vinemap.odometry.judgement import Fit
 
 Strategy = Literal["coarse to fine", "exhaustive"]
 ANGLES = (-9.0, 9.0)
@@ -33,8 +37,15 @@ SMALLEST_TEMPLATE = 5
 """Half width of a template in pixels."""
 ASIDE = 3
 """Quarters of a template that it is put aside by at most, either way, where its place shows no ground."""
+CLEAR_LEAD, LACKS = 0.5, 0.02
+"""Of what patches lack of a full correlation at the next best place, the most that they lack at a better one; and what
+they lack anyway."""
+FINE_SPREAD = 0.2
+"""Pixels by which patches disagree from which on they know better, even of frames that they see more coarsely."""
 LITTLE = 0.05
 """Share of a template that may show no ground."""
+UNSURE = (1.0, 1.0, 1e-4)
+"""Variances in pixels² and radians² of a step that too few patches tell about."""
 LARGEST_SHARE = 0.8
 """p_T above which nothing is left to move in."""
 
@@ -48,16 +59,23 @@ class Motion(NamedTuple):
     """To the left."""
     rotation_deg: float
     """Anticlockwise."""
-    score: float
+    covariance: Values
+    """Of the three (3, 3), in mm and degrees, by how much patches disagree."""
+    score: float = 0.0
     """Normalised cross-correlation of the template at its best place, up to 1."""
-    agreement: float
+    agreement: float = 0.0
     """Correlation of all that both frames show, so moved, by signs; of a few peaks that with the highest is chosen."""
-    rival: float
-    """The same for the next best place."""
-    overlap: float
+    rival: float = 0.0
+    """The same for the next best place that fine detail doesn't tell from it."""
+    overlap: float = 0.0
     """Share of the frame that the next one shows too."""
-    flag: str
-    """Why the step isn't to be believed: "blank", "overlap", "score", "repeats", "step", "blur"; or empty."""
+    flag: str = ""
+    """Why the step isn't to be believed: "blank", "blur", "overlap", "score", "ambiguous", "relief", "tilt", "step"; or
+    empty."""
+    scale: float = 1.0
+    """How much larger the next frame shows the ground: how much lower the camera is there."""
+    tilt_deg: float = np.nan
+    """Between the ground and the image's plane; unknown of short steps."""
 
     @property
     def movement(self) -> Pose:
@@ -155,20 +173,48 @@ def motion_between(
         cubic=method != "maximum",
     )
     if min(view.contrast, next_view.contrast) < LEAST_CONTRAST:
-        return _motion(camera, centre, Place(0.0, *centre), flag="blank")
+        return _motion(camera, centre, Place(0.0, *centre), None)._replace(flag="blank")
     n = coarseness(view.image)
-    peaks = [climb(fine, place, n + 1) for place in _candidates(view, next_view, fine)]
+    places, guess = _candidates(view, next_view, fine), expected and _place_of(camera, centre, expected)
+    peaks = [climb(fine, place, n + 1) for place in ([guess, *places[:-1]] if guess else places)]
     if search == "exhaustive":
         peaks.append(peak(fine, fine.whole))
     agreed = {index: agreement_at(view, next_view, centre, place_at(fine, index))[0] for index, _ in peaks}
-    top, score = max(peaks, key=lambda found: agreed[found[0]])
-    others = [index for index in agreed if np.hypot(index[1] - top[1], index[2] - top[2]) > APART * n]
-    rival = max((agreed[index] for index in others), default=0.0)
+    top, rival = _chosen(view, next_view, fine, agreed, guess)
     place = refine(fine, top, method)
+    patches = patches_at(view, next_view, centre, place)
+    fit = fit_of(patches, place, centre, camera.fx)
+    if fit and method == "aligned" and (fineness(view.image) == 1 or fit.spread > FINE_SPREAD):
+        place = fit.corrected(place)
     agreement, overlap = agreement_at(view, next_view, centre, place)
+    score = dict(peaks)[top]
     at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]
-    flag = doubt(view, next_view, at_limits, score=score, agreement=agreement, rival=rival)
-    return _motion(camera, centre, place, score, agreement, rival, overlap, flag)
+    flag = doubt(view, next_view, at_limits, score=score, agreement=agreement, rival=rival, patches=patches, fit=fit)
+    motion = _motion(camera, centre, place, fit)
+    return motion._replace(score=score, agreement=agreement, rival=rival, overlap=overlap, flag=flag)
+
+
+def _chosen(
+    view: View, next_view: View, fine: Search, agreed: Mapping[Index, float], expected: Place | None
+) -> tuple[Index, float]:
+    """The place at which most agrees, and what agrees at the next best one.
+
+    Of places at which nearly as much does, as on a pattern, patches of fine detail choose, else what is expected.
+    """
+    apart: list[Index] = []
+    for index in sorted(agreed, key=lambda index: -agreed[index]):
+        if all(np.hypot(index[1] - at[1], index[2] - at[2]) > APART * coarseness(view.image) for at in apart):
+            apart.append(index)
+    most = agreed[apart[0]]
+    equals = [index for index in apart if agreed[index] >= MOST_RIVAL * most]
+    if len(equals) > 1:
+        patches = {index: patches_at(view, next_view, fine.centre, place_at(fine, index)) for index in equals}
+        lacks = {index: LACKS + 1 - found.mean for index, found in patches.items()}
+        equals = [index for index in equals if lacks[index] * CLEAR_LEAD <= min(lacks.values())]
+    if len(equals) > 1 and expected:
+        equals.sort(key=lambda index: float(np.hypot(index[1] - expected.row, index[2] - expected.column)))
+    others = equals[1:] or [index for index in apart if agreed[index] < MOST_RIVAL * most]
+    return equals[0], max((agreed[index] for index in others), default=0.0)
 
 
 def expected_overlap(camera: Camera, movement: Pose) -> float:
@@ -206,20 +252,29 @@ def _template_centre(camera: Camera, half: int, expected: Pose | None, hidden: F
     return int(row), int(column)
 
 
-def _motion(
-    camera: Camera,
-    centre: tuple[int, int],
-    place: Place,
-    score: float = 0.0,
-    agreement: float = 0.0,
-    rival: float = 0.0,
-    overlap: float = 0.0,
-    flag: str = "",
-) -> Motion:
-    """Movement of the robot by that of the template (Eq. 8)."""
+def _place_of(camera: Camera, centre: tuple[int, int], movement: Pose) -> Place:
+    """Where the template of a movement is: the inverse of :func:`_motion`."""
+    x, y = camera.ground(centre[1], centre[0])
+    there = moved(movement, Pose(float(x), float(y), 0.0))
+    column, row = camera.pixel(there.x_mm, there.y_mm)
+    return Place(movement.heading_deg, float(row), float(column))
+
+
+def _motion(camera: Camera, centre: tuple[int, int], place: Place, fit: Fit | None) -> Motion:
+    """Movement of the robot by that of the template (Eq. 8), and how sure it is by patches."""
     c, s = np.cos(np.radians(place.angle)), np.sin(np.radians(place.angle))
-    dx, dy = camera.ground(centre[1], centre[0]) - np.array([[c, -s], [s, c]]) @ camera.ground(place.column, place.row)
-    return Motion(float(dx), float(dy), place.angle, score, agreement, rival, overlap, flag)
+    turn, there = np.array([[c, -s], [s, c]]), camera.ground(place.column, place.row)
+    dx, dy = camera.ground(centre[1], centre[0]) - turn @ there
+    slopes = np.eye(3)
+    slopes[:2, :2] = -turn @ camera.to_robot[:, :2]
+    slopes[:2, 2] = -np.array([[-s, -c], [c, -s]]) @ there
+    degrees = np.diag([1, 1, np.degrees(1)])
+    covariance = degrees @ slopes @ (fit.covariance if fit else np.diag(UNSURE)) @ slopes.T @ degrees
+    motion = Motion(float(dx), float(dy), place.angle, covariance)
+    if fit is None:
+        return motion
+    tilt = float(np.degrees(np.arctan(np.hypot(*fit.slope)))) if fit.slope is not None else np.nan
+    return motion._replace(scale=1 + fit.scale, tilt_deg=tilt)
 
 
 def _candidates(view: View, next_view: View, fine: Search) -> list[Place]:

@@ -6,21 +6,26 @@ from collections import Counter
 from itertools import chain, islice
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from vinemap.odometry.field import cleaner_of, field_of, learned
 from vinemap.odometry.frames import repeats
-from vinemap.odometry.poses import STILL, Pose, moved, onward
+from vinemap.odometry.poses import STILL, Pose, moved, onward, onward_covariance
 from vinemap.odometry.step import ANGLES, expected_overlap, motion_between
 from vinemap.odometry.views import LEAST_CONTRAST, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from vinemap.compute.arrays import Values
     from vinemap.config.camera import Camera
     from vinemap.odometry.frames import Frame
     from vinemap.odometry.refinement import Method
     from vinemap.odometry.step import Motion
     from vinemap.odometry.views import View
 
+UNSURE_MM, UNSURE_SHARE, UNSURE_DEG = 5.0, 0.5, 3.0
+"""Standard deviation of a movement that is carried on: millimetres and a share of it along an axis, and degrees."""
 KEY_OVERLAP = 0.4
 """Share of a frame that a keyframe must have in common with the frames that are measured from it."""
 
@@ -33,14 +38,17 @@ class Fix(NamedTuple):
     """Seconds, as the recording tells them."""
     pose: Pose
     """In the robot's frame at the first frame that shows something."""
-    score: float
-    agreement: float
-    overlap: float
-    """Of the step from the frame from which it was measured: see :class:`vinemap.odometry.step.Motion`."""
-    flag: str
-    """Why it couldn't be measured; empty where it was. A flagged pose is carried on by the last movement."""
-    measured_from: int | None
+    covariance: Values
+    """Of the pose (3, 3), in mm and degrees."""
+    height_mm: float
+    """Of the camera above the ground, by how large ground is from frame to frame, if it was the camera's at first."""
+    flag: str = ""
+    """Why it couldn't be measured; empty where it was. A flagged pose is carried on by the last movement, or is the
+    likeliest of several."""
+    measured_from: int | None = None
     """Number of the frame, from 0 on, from which it was measured."""
+    motion: Motion | None = None
+    """From there."""
 
 
 class _Anchor(NamedTuple):
@@ -49,6 +57,8 @@ class _Anchor(NamedTuple):
     number: int
     view: View
     pose: Pose
+    covariance: Values
+    height_mm: float
 
 
 def follow(
@@ -101,44 +111,44 @@ def follow(
     field = field_of(frame.image for frame in ahead if frame.image is not None)
     key = last = lost = None
     pose, velocity = STILL, STILL
+    covariance: Values = np.zeros((3, 3))
+    height = camera.above_ground_mm
     shown: Frame | None = None
     for number, frame in enumerate(chain(ahead, frames)):
+        if last is not None:
+            covariance = onward_covariance(pose, covariance, velocity, _of_a_guess(velocity))
         pose = onward(pose, velocity)
-        if frame.image is None:
-            yield _guess(frame, pose, frame.flaw)
-            continue
-        if shown is not None and repeats(shown, frame):
-            yield _guess(frame, pose, "repeated")
+        guess = Fix(frame.name, frame.time, pose, covariance, height)
+        if frame.image is None or (shown is not None and repeats(shown, frame)):
+            yield guess._replace(flag=frame.flaw or "repeated")
             continue
         shown = frame
         field = learned(field, frame.image)
         view = view_of(frame.image, camera=camera, method=method, cleaner=cleaner_of(field, camera))
         if view.contrast < LEAST_CONTRAST:
-            yield _guess(frame, pose, "blank")
+            yield guess._replace(flag="blank")
             continue
         if key is None or last is None:
-            key = last = _Anchor(number, view, pose)
-            yield _guess(frame, pose, "")
+            key = last = _Anchor(number, view, pose, covariance, height)
+            yield guess
             continue
         if not keyframes or expected_overlap(camera, moved(key.pose, pose)) < KEY_OVERLAP:
             key = last
         attempts = [(key, moved(key.pose, pose)), (last, moved(last.pose, pose)), (last, None)]
         attempts = attempts[key is last :] + ([(lost, None)] if lost else [])
-        reasons = []
-        for anchor, expected in attempts:
-            motion = measure(anchor, view, expected)
-            if not motion.flag:
-                break
-            reasons.append(motion.flag)
-        else:
-            lost = _Anchor(number, view, pose)
-            yield _guess(frame, pose, reasons[0])
+        anchor, motion = _best(((anchor, measure(anchor, view, expected)) for anchor, expected in attempts))
+        if motion.flag:
+            pose = onward(anchor.pose, motion.movement) if motion.flag == "ambiguous" else pose
+            lost = _Anchor(number, view, pose, covariance, height)
+            yield guess._replace(pose=pose, flag=motion.flag)
             continue
         pose = onward(anchor.pose, motion.movement)
+        covariance = onward_covariance(anchor.pose, anchor.covariance, motion.movement, motion.covariance)
+        height = anchor.height_mm / motion.scale
         before = anchor if anchor is lost else last
         velocity = _per_frame(moved(before.pose, pose), number - before.number)
-        last, key, lost = _Anchor(number, view, pose), anchor, None
-        yield Fix(frame.name, frame.time, pose, motion.score, motion.agreement, motion.overlap, "", anchor.number)
+        last, key, lost = _Anchor(number, view, pose, covariance, height), anchor, None
+        yield Fix(frame.name, frame.time, pose, covariance, height, "", anchor.number, motion)
 
 
 def stretches(fixes: Iterable[Fix]) -> list[int]:
@@ -151,8 +161,20 @@ def stretches(fixes: Iterable[Fix]) -> list[int]:
     return [known.get(root, 0) for root in roots]
 
 
-def _guess(frame: Frame, pose: Pose, flag: str) -> Fix:
-    return Fix(frame.name, frame.time, pose, 0.0, 0.0, 0.0, flag, None)
+def _best(attempts: Iterable[tuple[_Anchor, Motion]]) -> tuple[_Anchor, Motion]:
+    """The first step that is to be believed, else the first of several likely ones, else the first."""
+    tried = []
+    for anchor, motion in attempts:
+        if not motion.flag:
+            return anchor, motion
+        tried.append((anchor, motion))
+    return next((pair for pair in tried if pair[1].flag == "ambiguous"), tried[0])
+
+
+def _of_a_guess(velocity: Pose) -> Values:
+    """Covariance (3, 3) of a movement that is taken to be the last one again."""
+    place = UNSURE_MM + UNSURE_SHARE * float(np.hypot(velocity.x_mm, velocity.y_mm))
+    return np.diag([place**2, place**2, UNSURE_DEG**2])
 
 
 def _per_frame(movement: Pose, frames: int) -> Pose:

@@ -23,6 +23,8 @@ BACKGROUND = 4.0
 """Sigma in pixels of the coarse frames of what is taken off as uneven light."""
 DARKEST = 0.3
 """Light of a pixel, as a share, below which it is not brightened to its full contrast, as that of noise is."""
+GRAIN = 3.0
+"""Sigma in pixels of some 320 × 240 of what is taken off from fine detail."""
 LEAST_CONTRAST = 1.0
 """Standard deviation in grey levels below which a frame shows nothing."""
 
@@ -43,6 +45,8 @@ class View(NamedTuple):
     coarse: Values
     detail: Values
     """The coarse one without uneven light."""
+    fine: Values
+    """Detail finer than uneven light and shadows, at some 320 × 240 pixels."""
     contrast: float
     """Standard deviation in grey levels."""
     sharpness: float
@@ -75,13 +79,22 @@ def view_of(image: Image, *, camera: Camera, method: Method = "aligned", cleaner
     contrast = float(values.std())
     sharpness = float(cv2.Laplacian(smooth, cv2.CV_32F).std()) / max(contrast, LEAST_CONTRAST)
     kept = values if method == "maximum" else smooth
-    return View(kept, coarse, detail_of(coarse), contrast, sharpness, cleaner and cleaner.hidden)
+    n = fineness(values)
+    less = smooth if n == 1 else cv2.resize(smooth, None, fx=1 / n, fy=1 / n, interpolation=cv2.INTER_AREA)
+    fine = np.asarray(less - cv2.GaussianBlur(less, (0, 0), GRAIN), np.float32)
+    return View(kept, coarse, detail_of(coarse), fine, contrast, sharpness, cleaner and cleaner.hidden)
 
 
 def coarseness(image: Values) -> int:
     """Pixels along the side of one of the coarse search's."""
     shorter: int = min(image.shape)
     return max(1, round(shorter / COARSE_SIZE))
+
+
+def fineness(image: Values) -> int:
+    """Pixels along the side of one of the fine detail's."""
+    shorter: int = min(image.shape)
+    return max(1, round(shorter / SMOOTHED_SIZE))
 
 
 def reduced(image: Values) -> Values:

@@ -1,0 +1,127 @@
+"""Patches that must agree: what they correct, how sure they are, and what they flag."""
+
+import numpy as np
+import pytest
+
+from vinemap.measure.odometry.trials import template_error
+from vinemap.measure.odometry.troubles import TROUBLES, drive
+from vinemap.odometry.correlation import Place
+from vinemap.odometry.judgement import Patches, fit_of
+from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
+from vinemap.odometry.step import estimate_motion
+from vinemap.simulate.camera import LOW, RESOLUTION, above, lay_ground, render
+
+FOCAL = 300.0
+PLACE, CENTRE = Place(3.0, 100.0, 140.0), (120, 160)
+
+
+def patches(shift, turn, *, scale=0.0, slope=(0.0, 0.0), noise=0.0, seed=0):
+    """Patches that a movement, a scale and a slope put aside."""
+    places = np.stack(np.meshgrid(np.linspace(40, 280, 5), np.linspace(30, 210, 5)), axis=-1).reshape(-1, 2)
+    x, y = (places - [PLACE.column, PLACE.row]).T
+    far = np.array([PLACE.column - CENTRE[1], PLACE.row - CENTRE[0]]) / FOCAL
+    raised = slope[0] * x + slope[1] * y
+    shifts = np.column_stack([shift[0] - turn * y + scale * x, shift[1] + turn * x + scale * y])
+    shifts += raised[:, None] * far + np.random.default_rng(seed).normal(0, noise, places.shape)
+    return Patches(places, shifts, np.full(25, 0.9))
+
+
+def test_patches_tell_movement_scale_and_slope():
+    fit = fit_of(patches((0.4, -0.2), 0.002, scale=0.01, slope=(0.05, -0.08)), PLACE, CENTRE, FOCAL)
+    assert fit.scale == pytest.approx(0.01, abs=1e-9)
+    assert fit.slope == pytest.approx([0.05, -0.08], abs=1e-9)
+    assert fit.rest < 1e-9 < fit.spread
+    fit = fit_of(patches((0.4, -0.2), 0.002), PLACE, CENTRE, FOCAL)
+    assert fit.corrected(PLACE) == pytest.approx((3 + np.degrees(0.002), 99.8, 140.4))
+    assert fit_of(patches((0, 0), 0), Place(0.0, 120.0, 160.0), CENTRE, FOCAL).slope is None
+
+
+def test_how_sure_a_fit_is_follows_from_how_far_patches_disagree():
+    fits = [fit_of(patches((0, 0), 0, noise=0.3, seed=k), PLACE, CENTRE, FOCAL) for k in range(300)]
+    errors = np.array([[*fit.shift, fit.turn] for fit in fits])
+    assert errors.std(axis=0) == pytest.approx(np.sqrt(np.diag(np.mean([f.covariance for f in fits], axis=0))), rel=0.1)
+
+
+def test_a_patch_that_goes_its_own_way_does_not_agree():
+    some = patches((0.5, 0.5), 0)
+    some.shifts[3] = (5.0, -4.0)
+    some.scores[7] = 0.3
+    assert np.flatnonzero(~some.agree).tolist() == [3, 7]
+    assert some.fit
+    some.scores[8:] = 0.3
+    assert not some.fit
+
+
+def test_covariance_goes_along_with_the_movement():
+    rng = np.random.default_rng(2)
+    pose, step = Pose(10.0, -20.0, 30.0), Pose(60.0, 5.0, 4.0)
+    of_pose, of_step = np.diag([4.0, 1.0, 0.25]), np.diag([1.0, 2.0, 0.04])
+    tried = [
+        onward(Pose(*rng.multivariate_normal(pose, of_pose)), Pose(*rng.multivariate_normal(step, of_step)))
+        for _ in range(4000)
+    ]
+    found = np.cov(np.array(tried).T)
+    assert found == pytest.approx(onward_covariance(pose, of_pose, step, of_step), abs=0.35)
+
+
+@pytest.fixture(scope="module")
+def soil():
+    return lay_ground("soil", size_mm=(700, 600), seed=3)
+
+
+def pair(ground, *, far=60.0, camera=LOW, sunk=None):
+    robot = [above(np.array([x, 0.0]), 0.0) for x in (0.0, far)]
+    shots = [
+        render(ground, pose, camera=c, seed=k)
+        for k, (pose, c) in enumerate(zip(robot, (camera, sunk or camera), strict=True))
+    ]
+    return shots, moved(*robot)
+
+
+def test_a_camera_that_sinks_sees_ground_grow(soil):
+    shots, _ = pair(soil, sunk=LOW.model_copy(update={"above_ground_mm": 240.0}))
+    assert estimate_motion(*shots, camera=LOW).scale == pytest.approx(245 / 240, abs=0.001)
+    shots, _ = pair(soil)
+    assert estimate_motion(*shots, camera=LOW).scale == pytest.approx(1, abs=0.001)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 4.0])
+def test_the_tilt_of_ground_is_told(soil, degrees):
+    ny, nx = soil.image.shape
+    along = (np.arange(nx) - nx / 2) * RESOLUTION * np.tan(np.radians(degrees))
+    tilted = soil._replace(relief=np.tile(along.astype(np.float32), (ny, 1)))
+    shots, _ = pair(tilted)
+    motion = estimate_motion(*shots, camera=LOW)
+    assert motion.tilt_deg == pytest.approx(degrees, abs=0.4)
+    assert motion.flag == ""
+
+
+def test_relief_is_halved_by_patches():
+    shots, robot, _ = drive(TROUBLES["relief of 20 mm"], "soil", 8, seed=2)
+    for k in range(7):
+        motion = estimate_motion(shots[k], shots[k + 1], camera=LOW)
+        assert template_error(motion.movement, moved(robot[k], robot[k + 1]), LOW) < 0.25
+        assert abs(motion.rotation_deg - moved(robot[k], robot[k + 1]).heading_deg) < 0.25
+
+
+def test_the_bars_of_a_grate_are_told_apart_by_what_lies_between():
+    shots, robot, _ = drive(TROUBLES["grate"], "gravel", 4, seed=2)
+    for k in range(3):
+        motion = estimate_motion(shots[k], shots[k + 1], camera=LOW)
+        assert motion.flag == ""
+        assert template_error(motion.movement, moved(robot[k], robot[k + 1]), LOW) < 0.1
+
+
+def test_a_pattern_of_nothing_else_goes_with_the_movement_before(soil):
+    shots, truth = pair(soil._replace(image=np.tile(soil.image[:100, :100], (15, 18))), far=55.0)  # every 40 mm
+    for guess in (truth, Pose(truth.x_mm - 40, 0.0, 0.0)):
+        motion = estimate_motion(*shots, camera=LOW, expected=guess)
+        assert motion.flag == "ambiguous"
+        assert template_error(motion.movement, guess, LOW) < 1
+
+
+def test_shadows_that_move_are_never_believed():
+    shots, robot, _ = drive(TROUBLES["shadows that move"], "concrete", 6, seed=2)
+    for k in range(5):
+        motion = estimate_motion(shots[k], shots[k + 1], camera=LOW)
+        assert motion.flag or template_error(motion.movement, moved(robot[k], robot[k + 1]), LOW) < 5
