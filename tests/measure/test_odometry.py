@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from vinemap.errors import InputError
 from vinemap.measure.odometry.__main__ import main
-from vinemap.measure.odometry.tables import drift_table, loss_table, mark, size_table, terrain_tables
+from vinemap.measure.odometry.tables import drift_table, loss_table, mark, size_table, terrain_tables, trouble_table
 from vinemap.measure.odometry.trials import (
     FAILURE,
     METHODS,
@@ -22,6 +22,7 @@ from vinemap.measure.odometry.trials import (
     template_error,
     template_offset,
 )
+from vinemap.measure.odometry.troubles import Outcome
 from vinemap.odometry.poses import STILL, Pose
 from vinemap.simulate.camera import HIGH, LOW, PIECE, lay_ground
 from vinemap.simulate.steps import beyond, unrelated, walk
@@ -119,12 +120,23 @@ def test_what_is_lost_and_not_flagged_is_marked():
     assert loss_table({"pale": pale})[1][2:] == ["1000, 2", "1!", "0.90", "2, 50.0!", "1, 1", "1!"]
 
 
+def test_troubles_are_held_against_their_bars():
+    found = {
+        "none": Outcome(1000, 979, 0),
+        "mud on half of the lens": Outcome(1000, 500, 0),
+        "grate": Outcome(1000, 0, 2),
+    }
+    lines = trouble_table(found)
+    assert misses(lines) == ["97.9!", "2!"]
+    assert lines[-1] == ["all", "3000", "49.3", "2!"]
+
+
 def test_paths_and_times_are_held_against_their_bars():
     ends = zip(METHODS, (8, 4, 2, 2.4), (1, 1, 1, 0.2), strict=True)
     drift = {method: Drift(np.array([place, place]), np.array([turn, turn])) for method, place, turn in ends}
     assert misses(drift_table(drift)) == ["30!", "0.200!, 0.200"]
-    slow = Size(0.2, {"320 × 240": 0.009, "1280 × 720": 0.05}, 90.0, {})
-    assert misses(size_table([slow], 0.02)) == ["9.0!, 10.0"]
+    slow = Size(0.2, {"320 × 240": 0.01, "1280 × 720": 0.05}, 90.0, {})
+    assert misses(size_table([slow], 0.02)) == ["10.0!, 9.0"]
     assert misses(size_table([slow._replace(share=0.1)], 0.02)) == []
 
 

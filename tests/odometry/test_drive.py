@@ -113,6 +113,20 @@ def test_the_geopackage_keeps_its_contract(recording, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.gpkg", "two.gpkg"]
 
 
+def test_a_band_of_two_standard_deviations_lies_about_the_track(recording, tmp_path):
+    out = tmp_path / "track.gpkg"
+    map_drive([recording], out, camera=LOW, start=START)
+    found, band = (gpd.read_file(out, layer=name) for name in ("poses", "band"))
+    assert found["sd_m"].is_monotonic_increasing
+    assert 0 < found["sd_m"].iloc[-1] < 0.002
+    assert found["height_mm"].to_numpy() == pytest.approx(245, abs=0.5)
+    assert len(band) == 1
+    assert band.contains(found.geometry.iloc[-1]).all()
+    assert band["width_m"][0] == pytest.approx(4 * found["sd_m"].iloc[-1])
+    ahead = found.geometry.iloc[-1].distance(band.boundary[0])
+    assert ahead == pytest.approx(2 * found["sd_m"].iloc[-1], rel=0.1)
+
+
 def test_lost_steps_break_the_line_and_are_told(recording, tmp_path):
     shots = sorted(recording.iterdir())
     (tmp_path / "broken.png").write_bytes(b"\x89PNG")

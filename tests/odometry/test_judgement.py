@@ -6,7 +6,7 @@ import pytest
 from vinemap.measure.odometry.trials import template_error
 from vinemap.measure.odometry.troubles import TROUBLES, drive
 from vinemap.odometry.correlation import Place
-from vinemap.odometry.judgement import Patches, fit_of
+from vinemap.odometry.judgement import ALIKE, Patches, fit_of
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
 from vinemap.odometry.step import estimate_motion
 from vinemap.simulate.camera import LOW, RESOLUTION, above, lay_ground, render
@@ -39,7 +39,8 @@ def test_patches_tell_movement_scale_and_slope():
 def test_how_sure_a_fit_is_follows_from_how_far_patches_disagree():
     fits = [fit_of(patches((0, 0), 0, noise=0.3, seed=k), PLACE, CENTRE, FOCAL) for k in range(300)]
     errors = np.array([[*fit.shift, fit.turn] for fit in fits])
-    assert errors.std(axis=0) == pytest.approx(np.sqrt(np.diag(np.mean([f.covariance for f in fits], axis=0))), rel=0.1)
+    told = np.sqrt(np.diag(np.mean([fit.covariance for fit in fits], axis=0)) / ALIKE)
+    assert errors.std(axis=0) == pytest.approx(told, rel=0.1)
 
 
 def test_a_patch_that_goes_its_own_way_does_not_agree():

@@ -171,7 +171,7 @@ def test_a_track_opens_beside_the_rows(open_in_qgis, tmp_path):
         assert seen["errors"] == []
         assert seen["crs"] == ("EPSG:32632" if start else "")
         layers = {layer["name"]: layer for layer in seen["layers"]}
-        assert set(layers) == {"track", "poses"}
+        assert set(layers) == {"track", "poses", "band"}
         assert all(layer["valid"] and layer["styled"] and layer["about"] for layer in layers.values())
         assert [c["label"] for c in layers["poses"]["classes"]] == ["measured", "flagged"]
         assert layers["poses"]["aliases"]["heading_deg"] == "Heading, clockwise from north (°)"

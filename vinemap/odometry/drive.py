@@ -204,7 +204,7 @@ def _check_out(out: Path, rows: Path | None) -> None:
             layers = {str(name) for name, _ in pyogrio.list_layers(out)} - {"layer_styles"}
         except Exception as error:  # GDAL's errors come in several classes
             raise OutputError(f"{out}: is there, and isn't a track: choose another file") from error
-        if layers != set(TRACK_LAYERS):
+        if not {"track", "poses"} <= layers <= set(TRACK_LAYERS):
             raise OutputError(f"{out}: holds other layers ({', '.join(sorted(layers))}): choose another file")
 
 

@@ -49,6 +49,8 @@ PLANE = 0.5
 """Share of the patches' disagreement that is left if it is that of a plane that is tilted."""
 SHORT = 12.0
 """Pixels of movement below which parallax says nothing of a tilt."""
+ALIKE = 2.0
+"""How much more patches vary together than each for itself, as neighbours err alike."""
 LEAST_SPREAD = 0.015
 """Pixels by which patches disagree at least."""
 
@@ -133,7 +135,7 @@ def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float
     whole = np.hstack([rigid, bent])
     every, _, _, _ = np.linalg.lstsq(whole, shifts)
     rest = float(np.sqrt(np.sum((shifts - whole @ every) ** 2) / max(len(left) - 6, 1)))
-    covariance = max(spread, LEAST_SPREAD) ** 2 * np.linalg.inv(rigid.T @ rigid)
+    covariance = ALIKE * max(spread, LEAST_SPREAD) ** 2 * np.linalg.inv(rigid.T @ rigid)
     slope = every[4:] if np.hypot(*far) * focal > SHORT else None
     return Fit(moved[:2], float(moved[2]), covariance, float(every[3]), slope, spread, rest)
 

@@ -35,6 +35,8 @@ DATED = 1e8
 """Seconds from which on a time counts from 1970."""
 FARTHEST = 2000.0
 """Metres between a start and the nearest row from which on one of them must be wrong."""
+LEAST_SD = 1e-4
+"""Metres that a band is drawn for at least."""
 TRACK_LAYERS: dict[str, Layer] = {
     "track": Layer(
         "LineString",
@@ -48,15 +50,21 @@ TRACK_LAYERS: dict[str, Layer] = {
             ("x_m", "y_m", "heading_deg", "lat", "lon", "score", "agreement", "overlap", "height_mm", "tilt_deg"), REAL
         )
         | {"flag": TEXT, "measured_from": WHOLE, "stretch": WHOLE}
+        | {"sd_m": REAL, "sd_heading_deg": REAL}
         | {"row": TEXT, "row_distance_m": REAL, "row_position_m": REAL},
         "Poses of the robot, one a frame",
+    ),
+    "band": Layer(
+        "Polygon",
+        {"stretch": WHOLE, "width_m": REAL},
+        "Where the robot was: two standard deviations about each stretch of its track",
     ),
 }
 """What the GeoPackage of a robot's track holds."""
 
 
 def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
-    """Layers ``poses`` and ``track`` of the contract :data:`vinemap.odometry.layers.TRACK_LAYERS`, without rows.
+    """Layers of the contract :data:`vinemap.odometry.layers.TRACK_LAYERS`, without rows.
 
     Parameters
     ----------
@@ -94,6 +102,8 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
             "flag": [fix.flag for fix in fixes],
             "measured_from": [0 if fix.measured_from is None else fix.measured_from + 1 for fix in fixes],
             "stretch": stretches(fixes),
+            "sd_m": [np.sqrt(np.linalg.eigvalsh(fix.covariance[:2, :2])[-1]) / 1000 for fix in fixes],
+            "sd_heading_deg": [np.sqrt(fix.covariance[2, 2]) for fix in fixes],
             "row": "",
             "row_distance_m": np.nan,
             "row_position_m": np.nan,
@@ -101,7 +111,7 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
         geometry=shapely.points(xy),
         crs=crs,
     )
-    return {"track": _lines(poses), "poses": poses}
+    return {"track": _lines(poses), "poses": poses, "band": _bands(poses)}
 
 
 def beside_rows(poses: gpd.GeoDataFrame, rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
@@ -156,6 +166,18 @@ def _lines(poses: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
         course = np.hypot(*np.diff(group[["x_m", "y_m"]].to_numpy(), axis=0).T)
         records.append((number, len(group), course.sum(), spread, steps.mean(), shapely.linestrings(_xy(group))))
     columns = ["stretch", "n_poses", "length_m", "seconds", "score", "geometry"]
+    return gpd.GeoDataFrame(pd.DataFrame(records, columns=columns), geometry="geometry", crs=poses.crs)
+
+
+def _bands(poses: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """A polygon for each stretch: circles of two standard deviations about its poses, and what lies between them."""
+    records = []
+    for number, group in poses[poses["stretch"] > 0].groupby("stretch"):
+        sd = np.maximum(group["sd_m"].to_numpy(), LEAST_SD)
+        circles = shapely.buffer(group.geometry.to_numpy(), 2 * sd, quad_segs=4)
+        joined = shapely.convex_hull(shapely.union(circles[:-1], circles[1:]))
+        records.append((number, 4 * sd.max(), shapely.make_valid(shapely.union_all(joined))))
+    columns = ["stretch", "width_m", "geometry"]
     return gpd.GeoDataFrame(pd.DataFrame(records, columns=columns), geometry="geometry", crs=poses.crs)
 
 

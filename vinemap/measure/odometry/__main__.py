@@ -22,6 +22,7 @@ from vinemap.measure.odometry.tables import (
     relief_table,
     size_table,
     terrain_tables,
+    trouble_table,
 )
 from vinemap.measure.odometry.trials import (
     SHARES,
@@ -34,6 +35,7 @@ from vinemap.measure.odometry.trials import (
     seconds_of,
     size_of,
 )
+from vinemap.measure.odometry.troubles import troubles
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground
 from vinemap.simulate.steps import PATCH, walk
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     Panels = list[list[Panel]]
 
 PAGE = click.Path(exists=True, dir_okay=False, path_type=Path)
-PARTS = ("terrains", "relief", "sizes", "lost", "paths")
+PARTS = ("terrains", "relief", "sizes", "lost", "troubles", "paths")
 ROUGH = 8.0
 """Millimetres of relief on which steps are lost, too."""
 TITLES = {
@@ -57,6 +59,7 @@ TITLES = {
     "relief": "Grass with relief",
     "sizes": "Size of the template: time of a pair, highest speed, errors (Fig. 4.9 to 4.11)",
     "lost": "Lost: errors above 5 mm",
+    "troubles": "In trouble: steps that are believed, and those that are wrong all the same",
     "paths": "Error at the end of sinusoidal paths of 9.6 m, over their length (Fig. 4.8)",
 }
 
@@ -95,6 +98,11 @@ def lost(grounds: Sequence[str | Path], pairs: int) -> tuple[dict[str, Lines], d
     return {f"lost {pairs}": loss_table(found)}, {}
 
 
+def in_trouble(grounds: Sequence[str | Path], steps: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table of drives that are spoilt."""
+    return {"troubles": trouble_table(troubles(grounds, steps, seed=500_000))}, {}
+
+
 def paths(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
     """Table and plot of the error gathered along paths."""
     found = drifts(grounds, count, seed=100)
@@ -119,7 +127,7 @@ def main(
     out: Path,
     docs: Path | None,
 ) -> None:
-    """Measure odometry on simulated frames, on one core: terrains, relief, sizes, lost and paths, or some of them."""
+    """Measure odometry on simulated frames, on one core: all parts, or those named."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -132,6 +140,7 @@ def main(
         "relief": partial(relief, steps),
         "sizes": partial(sizes, grounds, min(steps, PATCH)),
         "lost": partial(lost, grounds, pairs),
+        "troubles": partial(in_trouble, grounds, steps),
         "paths": partial(paths, grounds, count),
     }
     tables: dict[str, Lines] = {}

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from vinemap.measure.odometry.trials import ByMethod, Drift, Losses, Size
+    from vinemap.measure.odometry.troubles import Outcome
     from vinemap.odometry.refinement import Method
 
     Lines = list[list[str]]
@@ -23,10 +24,12 @@ CEP, WORST_CEP, TURN, WORST_TURN = 0.03, 0.05, 0.08, 0.15
 CLOSER, STRAIGHTER = 85.0, 65.0
 """Percent by which errors of place and rotation are smaller than the standard algorithm's."""
 RELIEF_BARS = dict(zip(RELIEFS, ((0.08, 0.15), (np.inf, np.inf), (0.03, 0.10)), strict=True))
-MOST_SECONDS = 0.008
+MOST_SECONDS = 0.009
 """Of a pair of 320 × 240 with a template of 0.2."""
 LEAST_CONTRAST, MOST_WRONG = 10.0, 0.001
 """Grey levels from which on a share of the steps may be wrong at most."""
+LEAST_BELIEVED, MOST_BELIEVED_WRONG = {"none": 98.0, "spots": 50.0, "mud": 50.0}, 1 / 2000
+"""Percent of steps that are believed without trouble and through dirt; share of all that may be wrong and believed."""
 MOST_DRIFT, MOST_HEADING = 0.25, 0.15
 """Of paths: share of the standard algorithm's error of the place, and degrees a metre."""
 
@@ -122,6 +125,18 @@ def loss_table(found: Mapping[str, Losses]) -> Lines:
             mark((beyond.wrong & ~beyond.flagged).sum(), 0, 0),
         ]
         lines.append([name, *cells])
+    return lines
+
+
+def trouble_table(found: Mapping[str, Outcome]) -> Lines:
+    """Steps in trouble: how many are believed, and how many of these are wrong."""
+    lines = [["trouble", "steps", "believed %", "wrong and believed"]]
+    for name, (steps, believed, wrong) in found.items():
+        least = max((percent for word, percent in LEAST_BELIEVED.items() if word in name), default=0.0)
+        lines.append([name, str(steps), mark(100 * believed / steps, least, 1, at_least=True), str(wrong)])
+    steps, believed, wrong = map(sum, zip(*found.values(), strict=True))
+    most = MOST_BELIEVED_WRONG * steps
+    lines.append(["all", str(steps), f"{100 * believed / steps:.1f}", mark(wrong, most, 0)])
     return lines
 
 

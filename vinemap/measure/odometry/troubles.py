@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 NOISE = 3.0
 """Grey levels."""
+LENGTH = 50
+"""Steps of a drive."""
 SHAPE = LOW.height, LOW.width
 AGAIN = 0.15
 """Share of frames that a recorder repeats, or during which a robot stands still."""
@@ -91,6 +93,17 @@ def outcome(images: Sequence[Image], poses: Sequence[Pose], repeated: Sequence[b
         believed += not repeated[k]
         wrong += off > FAILURE
     return Outcome(len(images) - 1 - sum(repeated), believed, wrong)
+
+
+def troubles(grounds: Sequence[str | Path], steps: int, *, seed: int = 0) -> dict[str, Outcome]:
+    """What becomes of so many steps of each trouble, shared out among drives over the grounds."""
+    found = {}
+    for name, trouble in TROUBLES.items():
+        drives = [
+            drive(trouble, grounds[k % len(grounds)], LENGTH + 1, seed=seed + k) for k in range(-(-steps // LENGTH))
+        ]
+        found[name] = Outcome(*map(sum, zip(*(outcome(*driven) for driven in drives), strict=True)))
+    return found
 
 
 def _spots(rng: np.random.Generator, count: int, sizes: tuple[int, int]) -> Values:
