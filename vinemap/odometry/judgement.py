@@ -26,8 +26,9 @@ PATCH = 4
 """Pixels of coarse frames along the side of a patch."""
 CLEANEST = 90.0
 """Percentile of patches, by how much of them changed, that is neither covered nor blank."""
-CHANGED = 0.45
-"""Change of the cleanest patches, as a share of their detail, from which on ground has moved."""
+CHANGED, CHANGED_ROUGHLY = 0.45, 0.6
+"""Change of the cleanest patches, as a share of their detail, from which on ground has moved; and if frames lie on each
+other to half a step of the search only."""
 EVEN = 0.8
 """Sigma in pixels of what both coarse frames are blurred by, as turning blurs one of them."""
 FAINT = 1.0
@@ -176,8 +177,12 @@ def _vertex(values: Values, at: int) -> float:
     return at + (left - right) / (2 * (left - 2 * top + right)) if left + right < 2 * top else float(at)
 
 
-def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> tuple[float, float]:
+def agreement_at(
+    view: View, next_view: View, centre: Sequence[float], place: Place, *, most_change: float = CHANGED
+) -> tuple[float, float]:
     """Correlation of all that two coarse frames both show, and its share of a frame.
+
+    It is none where nothing moves, but for the cleanest patches, by so much change.
 
     It is the quadrant correlation, as Pearson's for normal values, which a few dark or bright spots that move with the
     camera can't decide: N. Blomqvist, On a measure of dependence between two random variables, 1950.
@@ -199,7 +204,7 @@ def agreement_at(view: View, next_view: View, centre: Sequence[float], place: Pl
     agreement = float(np.sin(np.pi / 2 * quadrants))
     if np.hypot(*(source - target)) < NEAR_STILL:
         inner = np.s_[3:-3, 3:-3]
-        agreement = agreement if change(moved[inner], b[inner]) < CHANGED else 0.0
+        agreement = agreement if change(moved[inner], b[inner]) < most_change else 0.0
     return agreement, overlap
 
 

@@ -6,6 +6,7 @@ robot's own is the negative.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from vinemap.errors import InputError
 from vinemap.odometry.correlation import COARSE_STEP, Place, Search, climb, coarse_peaks, peak, place_at, search_of
 from vinemap.odometry.field import cleaner_of
-from vinemap.odometry.judgement import MOST_RIVAL, agreement_at, doubt, fit_of, patches_at
+from vinemap.odometry.judgement import CHANGED, CHANGED_ROUGHLY, MOST_RIVAL, agreement_at, doubt, fit_of, patches_at
 from vinemap.odometry.poses import Pose, moved, onward
 from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, fineness, view_of
@@ -179,14 +180,15 @@ def motion_between(
     peaks = [climb(fine, place, n + 1) for place in ([guess, *places[:-1]] if guess else places)]
     if search == "exhaustive":
         peaks.append(peak(fine, fine.whole))
-    agreed = {index: agreement_at(view, next_view, centre, place_at(fine, index))[0] for index, _ in peaks}
+    agree = partial(agreement_at, view, next_view, centre)
+    agreed = {index: agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)[0] for index, _ in peaks}
     top, rival = _chosen(view, next_view, fine, agreed, guess)
     place = refine(fine, top, method)
     patches = patches_at(view, next_view, centre, place)
     fit = fit_of(patches, place, centre, camera.fx)
     if fit and method == "aligned" and (fineness(view.image) == 1 or fit.spread > FINE_SPREAD):
         place = fit.corrected(place)
-    agreement, overlap = agreement_at(view, next_view, centre, place)
+    agreement, overlap = agree(place, most_change=CHANGED if method == "aligned" else CHANGED_ROUGHLY)
     score = dict(peaks)[top]
     at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]
     flag = doubt(view, next_view, at_limits, score=score, agreement=agreement, rival=rival, patches=patches, fit=fit)
