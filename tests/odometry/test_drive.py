@@ -127,6 +127,34 @@ def test_a_band_of_two_standard_deviations_lies_about_the_track(recording, tmp_p
     assert ahead == pytest.approx(2 * found["sd_m"].iloc[-1], rel=0.1)
 
 
+def test_other_sensors_go_along(recording, robot, tmp_path):
+    wheels, known = tmp_path / "wheels.csv", tmp_path / "fixes.csv"
+    begun = 1778745600
+    wheels.write_text("time,speed_m_s\n" + "".join(f"{begun + k / 4},0.18\n" for k in range(-1, N + 1)))
+    end = moved(robot[0], robot[-1])
+    away = START.heading_deg - np.degrees(np.arctan2(end.y_mm, end.x_mm))
+    lon, lat, _ = Geod(ellps="WGS84").fwd(START.lon, START.lat, away, np.hypot(*end[:2]) / 1000 + 0.05)
+    last = f"{begun + (N - 1) / 4},{lat!r},{lon!r},0.001\n"
+    known.write_text(f"time,lat,lon,accuracy_m\n{begun},{START.lat},{START.lon},0.001\n{last}")
+    out = tmp_path / "track.gpkg"
+    summary = map_drive([recording], out, camera=LOW, start=START, motion=wheels, places=known)
+    assert "wheels say +13% of the way" in summary.line()
+    known.write_text(f"time,lat,lon,accuracy_m\n{begun},{START.lat},{START.lon},1\n{last}{begun + 1},45,9,0.1\n")
+    summary = map_drive([recording], out, camera=LOW, start=START, places=known)
+    assert "1 of 3 fixes left out" in summary.line()
+    found = gpd.read_file(out, layer="poses").iloc[-1]
+    assert abs(Geod(ellps="WGS84").inv(lon, lat, found["lon"], found["lat"])[2]) < 0.005
+    wheels.write_text(
+        f"time,speed_m_s\n{begun - 1},1.8\n{begun},1.8\n{begun + 1},1.8\n{begun + 2},1.8\n{begun + 3},1.8\n"
+    )
+    for options, says in [
+        ({"motion": wheels}, "of the way that frames show: is the unit"),
+        ({"places": known, "start": None}, "fixes need a start"),
+    ]:
+        with pytest.raises(InputError, match=says):
+            map_drive([recording], out, camera=LOW, **{"start": START} | options)
+
+
 def test_lost_steps_break_the_line_and_are_told(recording, tmp_path):
     shots = sorted(recording.iterdir())
     (tmp_path / "broken.png").write_bytes(b"\x89PNG")

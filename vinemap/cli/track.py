@@ -24,6 +24,10 @@ METHODS = ("aligned", "quadratic", "centroid", "maximum")
 @click.option("--start", type=StartParam(), help="Where the first frame was taken, heading clockwise from north.")
 @click.option("--rows", type=FILE, help="GeoPackage of vine rows, for the distance to the nearest one.")
 @click.option(
+    "--motion", type=FILE, help="CSV of time and wheel speeds or yaw rates, to bridge what frames don't tell."
+)
+@click.option("--fixes", type=FILE, help="CSV of time, lat, lon and accuracy_m of satellite fixes, to pull the track.")
+@click.option(
     "--template-share",
     type=SHARE,
     default=0.2,
@@ -39,6 +43,8 @@ def track(
     out: Path,
     start: Any,
     rows: Path | None,
+    motion: Path | None,
+    fixes: Path | None,
     template_share: float,
     turn: float,
     method: Any,
@@ -53,6 +59,8 @@ def track(
         camera=load_camera(camera),
         start=start,
         rows=rows,
+        motion=motion,
+        places=fixes,
         template_share=template_share,
         angles=(-turn, turn),
         method=method,

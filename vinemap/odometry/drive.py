@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,8 @@ from vinemap.geo.lines import read_lines
 from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers
-from vinemap.odometry.poses import STILL
+from vinemap.odometry.poses import STILL, moved
+from vinemap.odometry.sensors import Odometer, check_times, pulled, read_places, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow
 from vinemap.product.geopackage import write_geopackage
@@ -31,9 +33,12 @@ if TYPE_CHECKING:
     from vinemap.config.drives import Start
     from vinemap.odometry.frames import Frame
     from vinemap.odometry.refinement import Method
+    from vinemap.odometry.sensors import Wheels
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 
+LEAST_WAY, TOLD_OFF, MOST_OFF = 300.0, 0.05, 2.0
+"""Millimetres from which on wheels are held against frames, and how far they may differ, as a share and a factor."""
 MOST_SUNK = 0.02
 """Share of the camera's height by which it may change before that is said."""
 
@@ -49,6 +54,8 @@ class DriveSummary(NamedTuple):
     """How many poses have each flag."""
     length_m: float
     n_stretches: int
+    remarks: tuple[str, ...] = ()
+    """What is to be known of other sensors."""
     sunk: float = 0.0
     """Share of its height by which the camera came closer to the ground than its file says, at most."""
 
@@ -62,6 +69,7 @@ class DriveSummary(NamedTuple):
             said.append(f"{sum(self.flags.values())} flagged ({reasons})")
         if self.n_stretches > 1:
             said.append(f"in {self.n_stretches} stretches that nothing joins")
+        said += self.remarks
         if abs(self.sunk) > MOST_SUNK:
             said.append(f"ground came {100 * self.sunk:.0f}% closer than above_ground_mm: distances are as wrong there")
         return "; ".join(said)
@@ -74,6 +82,8 @@ def map_drive(
     camera: Camera,
     start: Start | None = None,
     rows: Path | None = None,
+    motion: Path | None = None,
+    places: Path | None = None,
     template_share: float = 0.2,
     angles: tuple[float, float] = ANGLES,
     method: Method = "aligned",
@@ -94,6 +104,10 @@ def map_drive(
         Where the first frame was taken; without it the track has no place on the map.
     rows : Path, optional
         Vine rows, for the distance to the nearest one; the track is in their CRS if that is metric. Wants a start.
+    motion : Path, optional
+        CSV of wheel speeds and yaw rates, which bridge what frames don't tell.
+    places : Path, optional
+        CSV of satellite fixes, which pull the track. Wants a start.
     show : callable
         Is given the frames and their number, where that is known, and gives them on: progress.
     step : callable
@@ -109,7 +123,11 @@ def map_drive(
     _check_out(out, rows)
     if rows and not start:
         raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
+    if places and not start:
+        raise InputError(f"{places}: fixes need a start: give --start lat,lon,heading, roughly")
     lines = _rows_of(rows) if rows else None
+    wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
+    known, odd_places = read_places(places, start) if places and start else (None, 0)
     crs = _crs_of(start, lines)
     source = read_recording(recording, camera=camera)
 
@@ -122,6 +140,7 @@ def map_drive(
             angles=angles,
             method=method,
             foresight=MEMORY,
+            sensor=Odometer(wheels) if wheels else None,
         )
         return list(told)
 
@@ -132,9 +151,21 @@ def map_drive(
         return layers | {"poses": beside_rows(layers["poses"], lines)}
 
     if lines is not None:
-        placed([Fix("", None, STILL, np.zeros((3, 3)), camera.above_ground_mm)])  # whether start and rows go together
+        placed(
+            [Fix("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)]
+        )  # whether start and rows go together
     fixes = step(STAGES[0], followed)
     _check_fixes(fixes, recording, camera)
+    remarks = []
+    if motion and wheels:
+        check_times(motion, wheels.times, fixes)
+        remarks += [f"{odd_wheels} lines of {motion} left out"] * (odd_wheels > 0) + _against_wheels(
+            motion, wheels, fixes
+        )
+    if places and known:
+        check_times(places, known.times, fixes)
+        fixes, far = step(STAGES[1], pulled, fixes, known)
+        remarks += [f"{odd_places + far} of {odd_places + len(known.sd)} fixes left out"] * (odd_places + far > 0)
     layers = step(STAGES[1], placed, fixes)
     step(STAGES[2], _write, layers, out)
     flags = [fix.flag for fix in fixes if fix.flag]
@@ -145,8 +176,25 @@ def map_drive(
         flags={flag: flags.count(flag) for flag in set(flags)},
         length_m=float(layers["track"]["length_m"].sum()),
         n_stretches=len(layers["track"]),
+        remarks=tuple(remarks),
         sunk=max((1 - fix.height_mm / camera.above_ground_mm for fix in fixes), key=abs),
     )
+
+
+def _against_wheels(path: Path, wheels: Wheels, fixes: Sequence[Fix]) -> list[str]:
+    """What wheels say otherwise than frames, in a line; InputError if it is so much that their unit must be wrong."""
+    seen = by_wheels = 0.0
+    for before, fix in pairwise(fixes):
+        driven = wheels.between(before.time, fix.time, STILL)
+        if driven and not before.flag and not fix.flag:
+            seen += float(np.hypot(*moved(before.pose, fix.pose)[:2]))
+            by_wheels += float(np.hypot(*driven[0][:2]))
+    if not (seen > LEAST_WAY and np.isfinite(wheels.speeds).all()):
+        return []
+    ratio = by_wheels / seen
+    if not 1 / MOST_OFF < ratio < MOST_OFF:
+        raise InputError(f"{path}: speeds make {ratio:.2g} of the way that frames show: is the unit the column's?")
+    return [f"wheels say {100 * (ratio - 1):+.0f}% of the way"] * (abs(ratio - 1) > TOLD_OFF)
 
 
 def _rows_of(path: Path) -> gpd.GeoDataFrame:

@@ -208,7 +208,7 @@ def _chosen(
         if all(np.hypot(index[1] - at[1], index[2] - at[2]) > APART * coarseness(view.image) for at in apart):
             apart.append(index)
     most = agreed[apart[0]]
-    equals = [index for index in apart if agreed[index] >= MOST_RIVAL * most]
+    equals = [index for index in apart if agreed[index] >= min(MOST_RIVAL * most, most)]
     if len(equals) > 1:
         patches = {index: patches_at(view, next_view, fine.centre, place_at(fine, index)) for index in equals}
         lacks = {index: LACKS + 1 - found.mean for index, found in patches.items()}

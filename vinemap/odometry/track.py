@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import chain, islice
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -24,10 +24,23 @@ if TYPE_CHECKING:
     from vinemap.odometry.step import Motion
     from vinemap.odometry.views import View
 
+
 UNSURE_MM, UNSURE_SHARE, UNSURE_DEG = 5.0, 0.5, 3.0
 """Standard deviation of a movement that is carried on: millimetres and a share of it along an axis, and degrees."""
+TIE_MM = 5.0
+"""Millimetres within which a place of a pattern is the one that wheels tell."""
 KEY_OVERLAP = 0.4
 """Share of a frame that a keyframe must have in common with the frames that are measured from it."""
+
+
+class Sensor(Protocol):
+    """What else knows how a robot moves."""
+
+    def between(self, start: float | None, end: float | None, usual: Pose) -> tuple[Pose, Values] | None:
+        """Movement and covariance from a time to another, if it knows, given the last movement."""
+
+    def learn(self, start: float | None, end: float | None, seen: Pose) -> None:
+        """Be held against a movement that frames tell."""
 
 
 class Fix(NamedTuple):
@@ -40,6 +53,8 @@ class Fix(NamedTuple):
     """In the robot's frame at the first frame that shows something."""
     covariance: Values
     """Of the pose (3, 3), in mm and degrees."""
+    of_step: Values
+    """Of the movement (3, 3) from the frame from which it was measured, or else from the frame before."""
     height_mm: float
     """Of the camera above the ground, by how large ground is from frame to frame, if it was the camera's at first."""
     flag: str = ""
@@ -70,6 +85,7 @@ def follow(
     method: Method = "aligned",
     keyframes: bool = True,
     foresight: int = 0,
+    sensor: Sensor | None = None,
 ) -> Iterator[Fix]:
     """Follow a robot frame by frame, each pose told as soon as its frame is there.
 
@@ -89,6 +105,9 @@ def follow(
     foresight : int
         Frames that are looked at before the first pose is told, for what stays in them: dirt, text, shadows. Without
         it, that is known after the first :data:`vinemap.odometry.field.FEWEST` of different ground.
+    sensor : Sensor, optional
+        By it a pose is carried on, where it knows, and a pattern's places are told apart:
+        :class:`vinemap.odometry.sensors.Odometer`.
 
     Raises
     ------
@@ -113,12 +132,15 @@ def follow(
     pose, velocity = STILL, STILL
     covariance: Values = np.zeros((3, 3))
     height = camera.above_ground_mm
+    time: float | None = None
     shown: Frame | None = None
     for number, frame in enumerate(chain(ahead, frames)):
-        if last is not None:
-            covariance = onward_covariance(pose, covariance, velocity, _of_a_guess(velocity))
-        pose = onward(pose, velocity)
-        guess = Fix(frame.name, frame.time, pose, covariance, height)
+        driven = sensor.between(time, frame.time, velocity) if sensor else None
+        step, of_step = driven or (velocity, _of_a_guess(velocity))
+        covariance = onward_covariance(pose, covariance, step, of_step)
+        pose = onward(pose, step)
+        taken, time = time, frame.time
+        guess = Fix(frame.name, frame.time, pose, covariance, of_step, height)
         if frame.image is None or (shown is not None and repeats(shown, frame)):
             yield guess._replace(flag=frame.flaw or "repeated")
             continue
@@ -129,15 +151,16 @@ def follow(
             yield guess._replace(flag="blank")
             continue
         if key is None or last is None:
+            covariance = np.zeros((3, 3))
             key = last = _Anchor(number, view, pose, covariance, height)
-            yield guess
+            yield guess._replace(covariance=covariance)
             continue
         if not keyframes or expected_overlap(camera, moved(key.pose, pose)) < KEY_OVERLAP:
             key = last
         attempts = [(key, moved(key.pose, pose)), (last, moved(last.pose, pose)), (last, None)]
         attempts = attempts[key is last :] + ([(lost, None)] if lost else [])
         anchor, motion = _best(((anchor, measure(anchor, view, expected)) for anchor, expected in attempts))
-        if motion.flag:
+        if motion.flag and not (driven and _tells_apart(motion, moved(anchor.pose, pose), number - anchor.number)):
             pose = onward(anchor.pose, motion.movement) if motion.flag == "ambiguous" else pose
             lost = _Anchor(number, view, pose, covariance, height)
             yield guess._replace(pose=pose, flag=motion.flag)
@@ -146,9 +169,11 @@ def follow(
         covariance = onward_covariance(anchor.pose, anchor.covariance, motion.movement, motion.covariance)
         height = anchor.height_mm / motion.scale
         before = anchor if anchor is lost else last
+        if sensor and number == last.number + 1:
+            sensor.learn(taken, frame.time, moved(last.pose, pose))
         velocity = _per_frame(moved(before.pose, pose), number - before.number)
         last, key, lost = _Anchor(number, view, pose, covariance, height), anchor, None
-        yield Fix(frame.name, frame.time, pose, covariance, height, "", anchor.number, motion)
+        yield Fix(frame.name, frame.time, pose, covariance, motion.covariance, height, "", anchor.number, motion)
 
 
 def stretches(fixes: Iterable[Fix]) -> list[int]:
@@ -169,6 +194,12 @@ def _best(attempts: Iterable[tuple[_Anchor, Motion]]) -> tuple[_Anchor, Motion]:
             return anchor, motion
         tried.append((anchor, motion))
     return next((pair for pair in tried if pair[1].flag == "ambiguous"), tried[0])
+
+
+def _tells_apart(motion: Motion, driven: Pose, frames: int) -> bool:
+    """Whether wheels tell which of several places of a pattern is right."""
+    off = moved(driven, motion.movement)
+    return motion.flag == "ambiguous" and frames == 1 and float(np.hypot(off.x_mm, off.y_mm)) < TIE_MM
 
 
 def _of_a_guess(velocity: Pose) -> Values:
