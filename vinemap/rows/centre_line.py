@@ -79,7 +79,9 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
     n = len(image)
     excess = _excess(blurred_down(image, cutoff / 20, CARRIED_ON))
     measured, weight, robust, ranked = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    centre: Values = np.zeros(n)
+    centre = image[:, 0].copy()
+    for i in range(n):
+        centre[i] = 0.0
     for _ in range(4):
         _centroids(excess, offsets, centre, reach, measured, weight)
         for i in range(n):
@@ -153,9 +155,9 @@ def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
     """
     none = float(np.float64(0.0))  # a plain 0 would have all compiled twice
     trend = _whittaker(values, weights, TREND * cutoff, none, none)
-    detail: Values = np.empty(len(values))
+    detail = values.copy()
     for i in range(len(values)):
-        detail[i] = values[i] - trend[i]
+        detail[i] -= trend[i]
     detail = _whittaker(detail, weights, cutoff, SLOPE * cutoff, DETAIL + none)
     for i in range(len(values)):
         detail[i] += trend[i]
