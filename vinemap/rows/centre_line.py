@@ -91,7 +91,7 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
         for i in range(n):
             weight[i] *= min(max(2 * weight[i] / typical - 0.5, 0.0), 1.0)
             robust[i] = weight[i]
-        before, moved = centre, 0.0
+        before = centre
         for _ in range(3):
             centre, held = _smoothed(measured, robust, cutoff), 0
             for i in range(n):
@@ -101,11 +101,18 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
             scale = 1.5 * quantile(ranked, held, 0.5) + 0.01 if held else 1.0
             for i in range(n):
                 robust[i] = weight[i] / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
-        for i in range(n):
-            moved = max(moved, abs(centre[i] - before[i]))
-        if moved < SETTLED:
+        if _farthest(centre, before) < SETTLED:
             break
     return centre
+
+
+@compiled
+def _farthest(values: Values, others: Values) -> float:
+    """How far values (n,) are from others at the most."""
+    most = 0.0
+    for i in range(len(values)):
+        most = max(most, abs(values[i] - others[i]))
+    return most
 
 
 @compiled
