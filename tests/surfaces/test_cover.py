@@ -43,7 +43,7 @@ def test_cover_does_not_follow_density_and_leaves_trees_out(vineyard, cloud):
     [
         ({}, 2.5, 0.5, 0.5),
         ({"height": 0.6, "half_width": 0.1, "bottom": 0.1, "leafiness": 20}, 2.5, 0.2, 0.3),
-        ({"height": 1.7, "half_width": 1.1, "leafiness": 6}, 2.4, 1.2, 1.5),
+        ({"height": 1.7, "half_width": 1.1, "leafiness": 6}, 2.4, 1.2, 1.6),
     ],
 )
 def test_the_level_follows_the_canopies(cloud, vines, spacing, least, most):

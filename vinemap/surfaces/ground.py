@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_opening
+from scipy.ndimage import binary_opening, gaussian_filter
 from scipy.special import ndtr, ndtri
 
 from vinemap.errors import InputError
@@ -27,10 +27,12 @@ GROUND = 2
 """ASPRS class of ground."""
 EVEN = 0.02
 """Metres that terrain may rise from cell to cell above what a fit was made along."""
-WEEDS = 0.3
-"""Metres between a cell's low height and its median up to which its vegetation is weeds, and not a canopy."""
-FEW = 6.0
-"""Points whose heights tell nothing of weeds."""
+WEEDS = 0.4
+"""Metres between a cell's low height and its high one up to which its vegetation is weeds, and not a canopy."""
+NEAR = 0.3
+"""Metres over which the last planes are fitted, and over which cells tell of weeds together."""
+UNEVEN = 0.05
+"""Share by which bare soil may be noisier at one place than at another."""
 
 
 class _Cells(NamedTuple):
@@ -128,10 +130,14 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
 
 def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Floats:
     """Terrain (ny, nx) that cells tell, in their own heights."""
-    noise = _noise(cells, quantile)
-    level = cells.low - noise * _depth(cells.n, quantile) * _soil_share(cells, noise, quantile)
+    half, points = _half_spread(cells, quantile, NEAR / resolution)
+    noise = _noise(half, points)
+    share = _soil_share(half / noise, points, quantile)
+    level = cells.low - noise * share * _depth(cells.n, quantile, _soil(cells, quantile))
     spread = cells.high - cells.low
     weight = np.where(cells.n > 0, np.minimum(cells.n, 15.0) / (1 + (spread / (8 * noise)) ** 2), 0.0)
+    # How high weeds have lifted a low height is a guess: bare soil beside them knows better.
+    weight /= 1 + (2 * (1 - share)) ** 2
     thin = binary_opening((cells.n > 3) & (spread < 8 * noise), np.ones((3, 3)))
     surface = np.zeros(level.shape)
     for reach, slack in ((1.5, 4.0), (1.5, 2.5), (1.0, 1.5), (0.6, 1.0), (0.6, 1.0)):
@@ -140,7 +146,7 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
         terrain |= thin & (above < terrace_height)
         terrain &= above > -3 * slack * tolerance
         surface = multiscale_fit(level, weight * terrain, reach / resolution)
-    return multiscale_fit(level, weight * terrain, 0.3 / resolution)
+    return multiscale_fit(level, weight * terrain, NEAR / resolution)
 
 
 def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Floats:
@@ -166,18 +172,37 @@ def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Floats:
     return surface + trend + reference
 
 
-def _depth(n: Floats, quantile: float) -> Floats:
-    """Expected order statistic of n standard normal heights (Blom 1958)."""
+def _depth(n: Floats, quantile: float, soil: Floats | float = 1.0) -> Floats:
+    """Expected order statistic of n heights of which a share is soil's, standard normal, and lowest (Blom 1958)."""
     rank = np.maximum(np.ceil(quantile * n), 1)
-    out: Floats = ndtri((rank - 0.375) / (np.maximum(n, 1) + 0.25))
+    out: Floats = ndtri(np.minimum((rank - 0.375) / (np.maximum(soil * n, 1) + 0.25), 0.9))
     return out
 
 
-def _soil_share(cells: _Cells, noise: float, quantile: float) -> Floats:
+def _soil(cells: _Cells, quantile: float) -> Floats:
+    """Share of each cell's points that lie below a canopy, about: it begins somewhere between two of the quantiles."""
+    begins = np.where(cells.middle - cells.low < WEEDS, (0.5 + 0.9) / 2, (quantile + 0.5) / 2)
+    return np.where(cells.high - cells.low < WEEDS, 1.0, begins)
+
+
+def _half_spread(cells: _Cells, quantile: float, sigma: float) -> tuple[Floats, Floats]:
+    """Standard deviation (ny, nx) of heights without a canopy, by their lower half, and how many points told it.
+
+    One cell's few points tell it too badly: it is the mean of the cells within about sigma (cells).
+    """
+    apart = _depth(cells.n, 0.5) - _depth(cells.n, quantile)
+    weight = np.where((cells.high - cells.low < WEEDS) & (apart > 0.1), cells.n, 0.0)
+    half = weight * (cells.middle - cells.low) / np.maximum(apart, 0.1)
+    total, mean = (gaussian_filter(v, sigma, mode="constant", truncate=2.5) for v in (weight, half))
+    return mean / np.maximum(total, 1e-9), total * max(4 * np.pi * sigma**2, 1)
+
+
+def _soil_share(ratio: Floats, points: Floats, quantile: float) -> Floats:
     """How much of the noise's depth lies between a cell's low quantile and its soil: 1 on bare soil, below 0 in weeds.
 
-    Heights in weeds are taken as even from the soil up, blurred by the noise: the taller the weeds, the wider the
-    quantiles lie apart, and the higher the low one stands above the soil instead of below it.
+    Heights in weeds are taken as even from the soil up, blurred by the noise: the taller the weeds, the greater the
+    ratio of their half spread to the noise, and the higher the low quantile stands above the soil instead of below it.
+    Since the least excess over 1 would tell of weeds already, only what is beyond chance does.
     """
     x = np.linspace(-4, 45, 2000)
     table = []
@@ -186,12 +211,14 @@ def _soil_share(cells: _Cells, noise: float, quantile: float) -> Floats:
         low, middle = np.interp([quantile, 0.5], share, x)
         table.append((middle - low, -low))
     apart, depth = np.array(table).T
-    bare = -float(ndtri(quantile))
-    spread = cells.middle - cells.low
-    # Few points tell little: they are taken for soil's until more of them say otherwise.
-    share = np.interp(spread / noise, apart, depth) / bare
-    share = (cells.n * share + FEW) / (cells.n + FEW)
-    return np.where(spread < WEEDS, share, 1.0)
+    # Standard error of the difference of two quantiles of normal heights, over their difference.
+    z = np.minimum(ndtri(quantile), -0.01)
+    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+    variance = quantile * (1 - quantile) / density**2 + np.pi / 2 - quantile * np.sqrt(2 * np.pi) / density
+    chance = np.sqrt(variance / np.maximum(points, 1)) / -z
+    excess = np.maximum(ratio - 1 - 2 * chance - UNEVEN, 0.0)
+    out: Floats = np.interp(-z * (1 + excess), apart, depth) / -z
+    return np.where(points > 0, out, 1.0)
 
 
 def _ramp(x: Floats) -> Floats:
@@ -200,8 +227,8 @@ def _ramp(x: Floats) -> Floats:
     return out
 
 
-def _noise(cells: _Cells, quantile: float) -> float:
-    """Standard deviation in metres of the heights of bare soil: that of the cells with the thinnest layers."""
-    dense = cells.n >= max(5.0, float(np.quantile(cells.n[cells.n > 0], 0.5)))
-    half = (cells.middle - cells.low)[dense] / -_depth(cells.n[dense], quantile)
-    return float(np.clip(np.quantile(half, 0.33), 0.005, 0.1)) if half.size else 0.03
+def _noise(half: Floats, points: Floats) -> float:
+    """Standard deviation in metres of the heights of bare soil: that of where layers are thinnest."""
+    told = points[points > 0]
+    dense = half[points >= max(5.0, float(np.median(told)))] if told.size else told
+    return float(np.clip(np.quantile(dense, 0.33), 0.005, 0.1)) if dense.size else 0.03
