@@ -85,7 +85,7 @@ def test_a_night_does_what_can_be_done_and_says_why_the_rest_cannot(survey, home
     (tmp_path / "in" / "two" / "small.laz").unlink()
     for k in range(2):
         las[list(range(k, len(las), 2))].write(tmp_path / "in" / "two" / f"tile {k}.laz")
-    (tmp_path / "in" / "two" / "flight.e57").write_bytes(b"ASTM-E57")
+    (tmp_path / "in" / "two" / "flight.rcp").write_bytes(b"RCP")
     (tmp_path / "in" / "noise.laz").write_bytes(b"no cloud" * 100)
     code, rows, errors = ended(start(tmp_path, home))
     assert code == 1
@@ -93,7 +93,7 @@ def test_a_night_does_what_can_be_done_and_says_why_the_rest_cannot(survey, home
     states = {row[0]: " ".join(row[1:]) for row in rows}
     assert "ends before its table of chunks" in states["cut"]
     assert "noise.laz: can't be read as LAS or LAZ" in states["noise"]
-    assert states["two"] == "passed over flight.e57 can't be read: save it as LAS or LAZ"
+    assert states["two"] == "passed over flight.rcp can't be read: save it as LAS or LAZ"
     assert json.loads((tmp_path / "out" / "two" / "A" / "run.json").read_text())["counts"]["rows"] == 6
     record = json.loads((tmp_path / "out" / "good" / "A" / "run.json").read_text())
     assert record["settings"]["polygon"]["c"] == 9
