@@ -9,7 +9,17 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.cloud.formats.told import CHUNK, Header, Points, axes_in, columns_of, reading, usable, whole_steps
+from vinemap.cloud.formats.told import (
+    CHUNK,
+    Header,
+    Points,
+    axes_in,
+    packed_records,
+    reading,
+    text_records,
+    usable,
+    whole_steps,
+)
 from vinemap.compute.extras import load
 from vinemap.errors import InputError
 
@@ -41,9 +51,9 @@ def read_pcd(path: Path) -> Points:
     names = axes_in(dtype.names or (), path)
     form = words["DATA"][0].lower()
     if form == "ascii":
-        chunks = _text(path, start, n, dtype, names)
+        chunks = text_records(path, start, n, _columns(dtype))
     elif form == "binary":
-        chunks = _packed(path, start, n, dtype, names)
+        chunks = packed_records(path, start, n, dtype)
     else:
         chunks = _unpacked(path, n, single=dtype[names[0]].itemsize == 4)
     return Points(Header(point_count=n), chunks)
@@ -75,31 +85,9 @@ def _dtype(words: dict[str, list[str]]) -> np.dtype[Any]:
     return np.dtype(fields)
 
 
-def _packed(path: Path, start: int, n: int, dtype: np.dtype[Any], names: tuple[str, ...]) -> Generator[Floats]:
-    with path.open("rb") as stream:
-        stream.seek(start)
-        left = n
-        while left:
-            records = np.fromfile(stream, dtype, min(CHUNK, left))
-            if len(records) == 0:
-                raise InputError(f"{path}: ends after {n - left:,} of {n:,} points: copy or download it again")
-            left -= len(records)
-            yield columns_of(records, names)
-
-
-def _text(path: Path, start: int, n: int, dtype: np.dtype[Any], names: tuple[str, ...]) -> Generator[Floats]:
-    import pandas as pd
-
-    columns = [name if k == 0 else f"{name}_{k}" for name in dtype.names or () for k in range(_width(dtype[name]))]
-    done = 0
-    with path.open("rb") as stream:
-        stream.seek(start)
-        how: dict[str, Any] = {"sep": r"\s+", "header": None, "names": columns, "nrows": n, "index_col": False}
-        for table in pd.read_csv(stream, **how, chunksize=CHUNK):
-            done += len(table)
-            yield columns_of(table.to_records(index=False), names)
-    if done < n:
-        raise InputError(f"{path}: ends after {done:,} of {n:,} points: copy or download it again")
+def _columns(dtype: np.dtype[Any]) -> list[str]:
+    """Names of the numbers on a line."""
+    return [name if k == 0 else f"{name}_{k}" for name in dtype.names or () for k in range(_width(dtype[name]))]
 
 
 def _width(field: np.dtype[Any]) -> int:

@@ -9,14 +9,12 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.cloud.formats.told import CHUNK, Header, Points, axes_in, columns_of, reading
+from vinemap.cloud.formats.told import Header, Points, packed_records, reading, text_records
 from vinemap.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
     from pathlib import Path
 
-    from vinemap.compute.arrays import Floats
 
 TYPES = {
     "char": "i1",
@@ -68,11 +66,11 @@ def read_ply(path: Path) -> Points:
     if any(kind == "list" for one in (*before, element) for _, kind in one.fields):
         raise InputError(f"{path}: lists stand before its points or among them: export it with points alone")
     if order == "=":
-        skip = sum(one.n for one in before)
-        chunks = _text(path, start, skip, element)
+        fields = [name for name, _ in element.fields]
+        chunks = text_records(path, start, element.n, fields, skip=sum(one.n for one in before))
     else:
         start += sum(one.n * _dtype(one, order).itemsize for one in before)
-        chunks = _packed(path, start, element, _dtype(element, order))
+        chunks = packed_records(path, start, element.n, _dtype(element, order))
     return Points(Header(point_count=element.n), chunks)
 
 
@@ -105,34 +103,3 @@ def _header(stream: IO[bytes], path: Path) -> tuple[str, list[_Element]]:
 
 def _dtype(element: _Element, order: str) -> np.dtype[Any]:
     return np.dtype([(name, order + kind) for name, kind in element.fields])
-
-
-def _packed(path: Path, start: int, element: _Element, dtype: np.dtype[Any]) -> Generator[Floats]:
-    names = axes_in(dtype.names or (), path)
-    with path.open("rb") as stream:
-        stream.seek(start)
-        left = element.n
-        while left:
-            records = np.fromfile(stream, dtype, min(CHUNK, left))
-            if len(records) == 0:
-                raise InputError(
-                    f"{path}: ends after {element.n - left:,} of {element.n:,} points: copy or download it again"
-                )
-            left -= len(records)
-            yield columns_of(records, names)
-
-
-def _text(path: Path, start: int, skip: int, element: _Element) -> Generator[Floats]:
-    import pandas as pd
-
-    fields = [name for name, _ in element.fields]
-    names = axes_in(tuple(fields), path)
-    with path.open("rb") as stream:
-        stream.seek(start)
-        how: dict[str, Any] = {"sep": r"\s+", "header": None, "names": fields, "skiprows": skip, "nrows": element.n}
-        done = 0
-        for table in pd.read_csv(stream, **how, index_col=False, chunksize=CHUNK):
-            done += len(table)
-            yield columns_of(table.to_records(index=False), names)
-    if done < element.n:
-        raise InputError(f"{path}: ends after {done:,} of {element.n:,} points: copy or download it again")

@@ -13,7 +13,7 @@ from pyproj.exceptions import CRSError
 from vinemap.errors import PASSING, BusyError, InputError, VinemapError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator
+    from collections.abc import Generator, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -120,6 +120,38 @@ def columns_of(records: NDArray[Any], names: tuple[str, ...]) -> Floats:
     classes = next((records[name] for name in records.dtype.names or () if is_class(name)), None)
     xyz = usable(np.column_stack([records[name] for name in names]), classes)
     return whole_steps(xyz) if all(records.dtype[name].itemsize == 4 for name in names) else xyz
+
+
+def packed_records(path: Path, start: int, n: int, dtype: np.dtype[Any]) -> Generator[Floats]:
+    """Coordinates of n records that lie packed in a file from a byte on, chunk by chunk."""
+    names, left = axes_in(dtype.names or (), path), n
+    with path.open("rb") as stream:
+        stream.seek(start)
+        while left:
+            records = np.fromfile(stream, dtype, min(CHUNK, left))
+            if len(records) == 0:
+                raise _ends(path, n - left, n)
+            left -= len(records)
+            yield columns_of(records, names)
+
+
+def text_records(path: Path, start: int, n: int, columns: Sequence[str], *, skip: int = 0) -> Generator[Floats]:
+    """Coordinates of n records, a line each, from a byte on and so many lines further, chunk by chunk."""
+    import pandas as pd
+
+    names, done = axes_in(tuple(columns), path), 0
+    how: dict[str, Any] = {"sep": r"\s+", "header": None, "names": list(columns), "skiprows": skip, "nrows": n}
+    with path.open("rb") as stream:
+        stream.seek(start)
+        for table in pd.read_csv(stream, **how, index_col=False, chunksize=CHUNK):
+            done += len(table)
+            yield columns_of(table.to_records(index=False), names)
+    if done < n:
+        raise _ends(path, done, n)
+
+
+def _ends(path: Path, done: int, n: int) -> InputError:
+    return InputError(f"{path}: ends after {done:,} of {n:,} points: copy or download it again")
 
 
 def axes_in(names: tuple[str, ...], path: Path) -> tuple[str, str, str]:
