@@ -104,10 +104,7 @@ def ring_of(p: Complex) -> Ints:
     n = len(p)
     chain = np.empty(n + 2, dtype=np.int64)
     lower = np.zeros(n, dtype=np.bool_)  # on a line, rounding could have a point on both chains
-    floor, size = (
-        int(np.int64(0)),
-        int(np.int64(0)),
-    )  # a plain 0 would have `append_to` compiled twice
+    floor = size = int(np.int64(0))  # a plain 0 would have `append_to` compiled twice
     for k in range(2 * n - 1):  # to the right over the lower points, back over the upper ones
         i = k if k < n else 2 * n - 2 - k
         if k == n:

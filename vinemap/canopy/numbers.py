@@ -12,7 +12,7 @@ import shapely
 
 from vinemap.canopy.points import LOWLY, above_weeds
 from vinemap.compute.compiled import compiled
-from vinemap.compute.order import select
+from vinemap.compute.order import quantile
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
@@ -198,19 +198,10 @@ def quantile_of(values: Values, start: Ints, q: float) -> Values:
 
 @compiled
 def _quantiles(first: int, last: int, values: Values, start: Ints, q: float, out: Values) -> None:
-    """Write quantiles between ranks, as numpy's; the values lose their order within sections."""
+    """Write quantiles of sections, whose values lose their order."""
     for k in range(first, last):
-        n = start[k + 1] - start[k]
-        if n == 0:
-            continue
-        place = 1 + (n - 1) * q
-        rank = math.floor(place)
-        at, part = start[k] + rank - 1, place - rank
-        select(values, start[k], start[k + 1], at)
-        upper = values[min(at + 1, start[k + 1] - 1)]
-        for p in range(at + 2, start[k + 1]):
-            upper = min(upper, values[p])
-        out[k] = values[at] * (1 - part) + upper * part
+        if start[k + 1] > start[k]:
+            out[k] = quantile(values, start[k], start[k + 1], q)
 
 
 def summarise_rows(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:

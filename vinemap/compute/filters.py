@@ -11,8 +11,8 @@ from vinemap.compute.compiled import compiled
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Values
 
-MIRRORED, CARRIED_ON, NOTHING = 0, 1, 2
-"""What lies beyond the edges: the image again, its outermost values, or zeros."""
+MIRRORED, CARRIED_ON = 0, 1
+"""What lies beyond the edges: the image again, or its outermost values."""
 
 
 @compiled
@@ -32,19 +32,15 @@ def blurred_down(image: Values, sigma: float, edge: int) -> Values:
         if edge == MIRRORED:
             line %= 2 * n
             line = min(line, 2 * n - 1 - line)
-        elif edge == CARRIED_ON:
-            line = min(max(line, 0), n - 1)
-        lines[at] = line if 0 <= line < n else -1
-    nothing = np.zeros(m)
+        lines[at] = min(max(line, 0), n - 1)
     for i in range(n):
         here = out[i]
         for j in range(m):
             here[j] = weights[0] * image[i, j]
         for k in range(1, radius + 1):
             a, b, weight = lines[i + radius - k], lines[i + radius + k], weights[k]
-            before, after = image[a] if a >= 0 else nothing, image[b] if b >= 0 else nothing
             for j in range(m):
-                here[j] += weight * (before[j] + after[j])
+                here[j] += weight * (image[a, j] + image[b, j])
     return out
 
 

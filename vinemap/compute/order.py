@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from vinemap.compute.compiled import compiled
 
@@ -39,14 +38,13 @@ def select(values: Values, first: int, last: int, rank: int) -> float:
 
 
 @compiled
-def quantile(values: Values, n: int, q: float) -> float:
-    """Quantile of the first n values, between two ranks a straight line, as numpy's; their order changes."""
-    at, first = q * (n - 1), int(np.int64(0))  # a plain 0 would have `select` compiled twice
-    rank = int(at)
-    lower = select(values, first, n, rank)
-    if rank == n - 1:
-        return lower
-    upper = values[rank + 1]
-    for k in range(rank + 2, n):
-        upper = min(upper, values[k])
-    return float(lower + (at - rank) * (upper - lower))
+def quantile(values: Values, first: int, last: int, q: float) -> float:
+    """Quantile of the values from first to last - 1, between ranks as numpy's; they lose their order."""
+    place = 1 + (last - first - 1) * q
+    rank = math.floor(place)
+    at, part = first + rank - 1, place - rank
+    lower = select(values, first, last, at)
+    upper = values[min(at + 1, last - 1)]
+    for p in range(at + 2, last):
+        upper = min(upper, values[p])
+    return float(lower * (1 - part) + upper * part)

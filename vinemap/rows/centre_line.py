@@ -76,7 +76,7 @@ def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
 @compiled
 def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Values:
     """Smoothed centroids (n,) of canopy (n, m) within reach of them."""
-    n = len(image)
+    n, first = len(image), int(np.int64(0))  # a plain 0 would have `quantile` compiled twice
     excess = _excess(blurred_down(image, cutoff / 20, CARRIED_ON))
     measured, weight, robust, ranked = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     centre = image[:, 0].copy()
@@ -87,7 +87,7 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
         for i in range(n):
             ranked[i] = weight[i]
         # Stations of a stray leaf or two tell nothing of the row's middle.
-        typical = max(quantile(ranked, n, 0.7), 1e-9)
+        typical = max(quantile(ranked, first, n, 0.7), 1e-9)
         for i in range(n):
             weight[i] *= min(max(2 * weight[i] / typical - 0.5, 0.0), 1.0)
             robust[i] = weight[i]
@@ -98,7 +98,7 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
                 if weight[i] > 0:
                     ranked[held] = abs(measured[i] - centre[i])
                     held += 1
-            scale = 1.5 * quantile(ranked, held, 0.5) + 0.01 if held else 1.0
+            scale = 1.5 * quantile(ranked, first, held, 0.5) + 0.01 if held else 1.0
             for i in range(n):
                 robust[i] = weight[i] / (1 + ((measured[i] - centre[i]) / (2 * scale)) ** 2)
         if _farthest(centre, before) < SETTLED:
@@ -118,12 +118,12 @@ def _farthest(values: Values, others: Values) -> float:
 @compiled
 def _excess(image: Values) -> Values:
     """Cover (n, m) above what isn't canopy, where its flanks tell its middle, and cover only how well it was seen."""
-    n, m = image.shape
+    (n, m), first = image.shape, int(np.int64(0))
     ranked = np.zeros(n)
     for i in range(n):
         for j in range(m):
             ranked[i] = max(ranked[i], image[i, j])
-    strength = quantile(ranked, n, 0.7)
+    strength = quantile(ranked, first, n, 0.7)
     for i in range(n):
         for j in range(m):
             image[i, j] = min(max(image[i, j] - BACKGROUND * strength, 0.0), (FULL - BACKGROUND) * strength)
