@@ -1,25 +1,20 @@
-"""Names of files: the only place where one is written, which has as many lines as there are."""
+"""Names of files: the only place where one is written."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+
+from vinemap.naming import plain, safe, url_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 DATA = Path("data")
-LONGEST_NAME = 64
-MOST_BYTES = 160
-"""Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
-FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%(?=[0-9a-fA-F]{2})')
-"""What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
-DEVICES = re.compile(r"(con(in\$|out\$)?|prn|aux|nul|(com|lpt)[\d¹²³]) *(\..*)?", re.IGNORECASE)
-"""Names that Windows keeps for itself."""
 EPT = "ept.json"
 """File that tells of Entwine Point Tiles, in their folder."""
 PIECES = ".pieces-"
@@ -57,17 +52,6 @@ TABLE_2_1, PACKED_EXAMPLE = _packed(DATA / "table_2_1.csv"), _packed(EXAMPLE)
 """The thesis's table of rows, and the example's configuration as it comes with the package."""
 
 
-def safe(name: str) -> str:
-    """A name as a file can have it on any system: the name itself, if it can."""
-    plain = _cut(FORBIDDEN.sub("-", name).lstrip(".- "))
-    return f"_{plain}" if not plain or DEVICES.fullmatch(plain) else plain
-
-
-def _cut(name: str) -> str:
-    """A name no longer than one may be, and without the end that Windows would leave out."""
-    return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ")
-
-
 def bare(cloud: Path) -> str:
     """Name of a cloud without what tells its format (``.laz``, ``.copc.laz``); EPT is called as its folder."""
     if cloud.name == EPT:
@@ -76,35 +60,20 @@ def bare(cloud: Path) -> str:
     return re.sub(r"\.copc$", "", name.stem, flags=re.IGNORECASE)
 
 
-def url_of(cloud: Path) -> str | None:
-    """Address of a cloud on a web server, of which a path has one slash less; None of a file."""
-    return str(Address(cloud.as_posix())) if cloud.parts[:1] in (("http:",), ("https:",)) else None
-
-
 def stem(cloud: Path) -> str:
     """That name, fit to name other files."""
-    return _plain(bare(cloud))
-
-
-def _plain(name: str) -> str:
-    """A name without what makes trouble in names of files and on command lines."""
-    return _cut(re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", name)) or "cloud"
+    return plain(bare(cloud))
 
 
 def named_by(clouds: Sequence[Path]) -> str:
     """What a survey is called after its files: a single one, or the folder that holds them all."""
     folders = {cloud.resolve().parent.parent if cloud.name == EPT else cloud.resolve().parent for cloud in clouds}
-    return stem(clouds[0]) if len(clouds) == 1 or len(folders) > 1 else _plain(folders.pop().name)
+    return stem(clouds[0]) if len(clouds) == 1 or len(folders) > 1 else plain(folders.pop().name)
 
 
 def configuration(survey: str) -> Path:
     """Configuration of a survey."""
     return Path("configs") / f"{survey}.yaml"
-
-
-def shown(path: Path | str) -> str:
-    """A path as it can be printed and stored, even if its name isn't Unicode."""
-    return os.fsencode(path).decode(errors="replace")
 
 
 def survey_cloud(survey: str) -> Path:
@@ -294,15 +263,6 @@ def ept_node(folder: Path, key: str, kind: str) -> Path:
 def ept_page(folder: Path, key: str) -> Path:
     """A part of the list of their cubes."""
     return ept_folder(folder, "hierarchy") / f"{key}.json"
-
-
-class Address(PurePosixPath):
-    """A path of a file on a web server, as people know it."""
-
-    def __str__(self) -> str:
-        """Address of the file."""
-        scheme, _, rest = super().__str__().partition(":/")
-        return f"{scheme}://{rest.lstrip('/')}"
 
 
 def piece(folder: Path, number: int) -> Path:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.cloud.formats.kinds import IN_FOLDERS, is_surface, kind_of
 from vinemap.cloud.formats.remote import Ranges
 from vinemap.cloud.las_end import begins_as_las, read_head
@@ -43,7 +43,7 @@ def cloud_files(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
     """
     found: list[Path] = []
     for path in listed(clouds):
-        if not path.is_dir() or paths.url_of(path):
+        if not path.is_dir() or naming.url_of(path):
             found.append(path)
             continue
         try:
@@ -151,4 +151,4 @@ def _rank(path: Path) -> tuple[bool, bool, bool]:
 def worded(files: Sequence[Path]) -> str:
     """Files as an error names them."""
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"{paths.url_of(files[0]) or files[0]}{more}"
+    return f"{naming.url_of(files[0]) or files[0]}{more}"

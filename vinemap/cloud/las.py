@@ -14,6 +14,7 @@ from vinemap.cloud.copc import is_copc, points_about
 from vinemap.cloud.files import listed, worded
 from vinemap.cloud.formats.chunks import other_chunks
 from vinemap.cloud.formats.kinds import kind_of
+from vinemap.cloud.formats.told import needed
 from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
@@ -156,7 +157,7 @@ def _chunks_of(
             continue
         with opened(path, crs=crs) as (reader, source, layout):
             box = _small_box(reader.header, source, around) if around else None
-            found = points_about(path, layout, box, _needed()) if box else None
+            found = points_about(path, layout, box, needed()) if box else None
             chunks = _usable_chunks(reader, path, found)
             first = next(chunks, None)
             if first is None and found is None:
@@ -182,7 +183,7 @@ def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS, La
         raise InputError(f"{path}: no such file")
     try:
         layout = read_layout(path)
-        reader = laspy.open(path, laz_backend=_backends(layout), decompression_selection=_needed())
+        reader = laspy.open(path, laz_backend=_backends(layout), decompression_selection=needed())
     except OURS:
         raise
     except BaseException as error:
@@ -199,13 +200,6 @@ def _backends(layout: Layout) -> Any:
 
     whole = layout.chunks and layout.widest * layout.head.point_length <= MOST_BYTES
     return laspy.LazBackend.LazrsParallel if whole else laspy.LazBackend.Lazrs
-
-
-def _needed() -> Any:
-    """What is decompressed of a point, where the format lets the rest be: not colours, intensities and times."""
-    from laspy import DecompressionSelection as Selection
-
-    return Selection.XY_RETURNS_CHANNEL | Selection.Z | Selection.CLASSIFICATION | Selection.FLAGS
 
 
 def _check_header(header: Any, crs: CRS, path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.cloud.files import listed
 from vinemap.cloud.las import collected, open_cloud
 from vinemap.errors import InputError
@@ -65,7 +65,7 @@ def split_cloud(
         If the folder is full.
     """
     files = listed(clouds)
-    with open_cloud(files, crs=crs, around=_all_of(boundaries) if any(map(paths.url_of, files)) else None) as (
+    with open_cloud(files, crs=crs, around=_all_of(boundaries) if any(map(naming.url_of, files)) else None) as (
         place,
         chunks,
     ):

@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 
 from vinemap.config.yaml_files import checked_by
 from vinemap.errors import ConfigError
-from vinemap.paths import safe
+from vinemap.naming import safe
 
 
 def check_name(name: str) -> str:
@@ -29,7 +29,7 @@ def check_name(name: str) -> str:
 def check_parcel(name: str) -> str:
     """Return the name of a parcel, its Unicode composed and its spaces single.
 
-    Its files are named by what :func:`vinemap.paths.safe` makes of it ("123/4" lies in the folder "123-4").
+    Its files are named by what :func:`vinemap.naming.safe` makes of it ("123/4" lies in the folder "123-4").
 
     Raises
     ------

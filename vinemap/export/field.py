@@ -12,7 +12,7 @@ import pyogrio
 import shapely
 from pyogrio.errors import DataLayerError, DataSourceError
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.errors import InputError
 from vinemap.export.lanes import lanes_between
 from vinemap.geo.crs import WGS84, is_local
@@ -106,7 +106,7 @@ def products_of(given: Path) -> list[Path]:
         return [given]
     products = sorted(record.parent for record in given.glob(f"*/{paths.RUN}"))
     if not products:
-        raise InputError(f"{paths.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
+        raise InputError(f"{naming.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
     return products
 
 
@@ -125,11 +125,12 @@ def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
         origin_of(record["origin"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{paths.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, or its GeoPackage"
+            f"{naming.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, "
+            "or its GeoPackage"
         ) from error
     path = paths.geopackage(folder, record["parcel"])
     if product not in (folder, path):
-        raise InputError(f"{paths.shown(product)}: no product of vinemap: {paths.shown(path)} is one")
+        raise InputError(f"{naming.shown(product)}: no product of vinemap: {naming.shown(path)} is one")
     return folder, record
 
 
@@ -147,17 +148,17 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     try:
         layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("rows", "row_ends", "gaps", "parcel")}
     except (DataSourceError, DataLayerError) as error:
-        raise InputError(f"{paths.shown(path)}: can't be read ({error}): map the parcel again") from error
+        raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
     rows = layers["rows"].sort_values("row_id", ignore_index=True)
     if len(rows) == 0:
-        raise InputError(f"{paths.shown(path)}: has no row to export")
+        raise InputError(f"{naming.shown(path)}: has no row to export")
     bounded = bool(record.get("bounded"))
     within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
     lanes = lanes_between(rows if lines != "rows" else rows[:0], within, **drawn)
     if lines != "rows" and len(lanes) == 0:
         raise InputError(
-            f"{paths.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"
+            f"{naming.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"
         )
     known: dict[str, Any] = {
         "bounded": bounded,

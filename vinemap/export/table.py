@@ -14,7 +14,7 @@ import pandas as pd
 import pyogrio
 from pyogrio.errors import DataLayerError, DataSourceError
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.compute.threads import in_threads
 from vinemap.errors import InputError
 from vinemap.evaluate.changes import follow_rows
@@ -152,7 +152,7 @@ def read_tables(products: Sequence[Path]) -> Tables:
         key = one.about["survey"], one.about["flown"], one.about["parcel"]
         if key in seen:
             raise InputError(
-                f"{paths.shown(folder)} and {paths.shown(seen[key])}: both are {key[2]} of {key[0]}, "
+                f"{naming.shown(folder)} and {naming.shown(seen[key])}: both are {key[2]} of {key[0]}, "
                 f"flown on {key[1]}: leave one out"
             )
         seen[key] = folder
@@ -183,7 +183,7 @@ def _read(folder: Path, record: dict[str, Any]) -> _Product:
         rows = pyogrio.read_dataframe(path, layer="rows")
         vines = pyogrio.read_dataframe(path, layer="vines") if "vines" in pyogrio.list_layers(path)[:, 0] else None
     except (DataSourceError, DataLayerError) as error:
-        raise InputError(f"{paths.shown(path)}: can't be read ({error}): map the parcel again") from error
+        raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
     if vines is not None and not is_local(vines.crs):
         places = vines.geometry.to_crs(WGS84)
         vines = vines.assign(lat=places.y, lon=places.x)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
-from vinemap import __version__, paths
+from vinemap import __version__, naming, paths
 from vinemap.errors import InputError
 from vinemap.export import MESHES, TABLE
 from vinemap.export.agopengps import write_agopengps
@@ -74,7 +74,7 @@ def export_products(
     wanted = lines if set(of_parcels) - set(MESHES) else "rows"
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
     fields = [read_field(product, lines=wanted, **drawn) for product in products] if of_parcels else []
-    names = [paths.safe(field.parcel) for field in fields]
+    names = [naming.safe(field.parcel) for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
     tables = read_tables(products) if TABLE in formats else None
@@ -98,14 +98,14 @@ def export_products(
                 target, partial(write, field, **options), _record(field, kind, {"lines": lines} | drawn | options)
             )
         yield (
-            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {paths.shown(target.parent)} "
+            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {naming.shown(target.parent)} "
             f"({', '.join(of_parcels)})"
         )
     if tables:
         target = paths.table_folder(out)
         record = {"vinemap": __version__, "format": TABLE, "products": tables.products}
         _write_whole(target, partial(write_tables, tables), record)
-        yield f"{tables.told()} → {paths.shown(target)}"
+        yield f"{tables.told()} → {naming.shown(target)}"
 
 
 def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once, tiles_in
 from vinemap.cloud.formats.identity import parts_of
 from vinemap.cloud.formats.kinds import kind_of
@@ -117,7 +117,7 @@ def arrivals(estate: EstateConfig, *, now: float | None = None) -> Iterator[Arri
             else:
                 del seen[known]
         except VinemapError as error:
-            yield Arrival(paths.shown(path.name), None, str(error))
+            yield Arrival(naming.shown(path.name), None, str(error))
         except OSError as error:
             yield Arrival(path.name, None, f"{path}: can't be read ({error.strerror})")
 
@@ -179,7 +179,7 @@ def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConf
     used = [p for p in (*clouds, config.boundaries, config.rows, config.vines, own) if p]
     for file in used:
         _check(file)
-    age = now - max(part.stat().st_mtime for p in used if not paths.url_of(p) for part in parts_of(p))
+    age = now - max(part.stat().st_mtime for p in used if not naming.url_of(p) for part in parts_of(p))
     if 0 <= age < estate.settle:
         return Arrival(name, None, f"changed {age:.0f} s ago, waits until {estate.settle:.0f} s", waits=True)
     for cloud in clouds:
@@ -250,9 +250,9 @@ def _unusable(path: Path) -> str | None:
 
 
 def _check(file: Path) -> None:
-    if (shown := paths.shown(file)) != str(file):
+    if (shown := naming.shown(file)) != str(file):
         raise InputError(f"{shown}: its name isn't Unicode: rename it")
-    if not (file.is_file() or paths.url_of(file)):
+    if not (file.is_file() or naming.url_of(file)):
         raise InputError(f"{file}: no such file")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.errors import BusyError, InputError, OutputError
 from vinemap.evaluate.changes import are_others, estimate_shift, lie_aside
 from vinemap.evaluate.rows import match_rows
@@ -252,7 +252,7 @@ def _product(product: Path) -> _Product:
     parcel = str(record["parcel"])
     rows = read_rows(folder, parcel)
     if rows is None:
-        raise InputError(f"{paths.shown(product)}: its rows can't be read: map the parcel again")
+        raise InputError(f"{naming.shown(product)}: its rows can't be read: map the parcel again")
     if is_local(rows.crs):
         raise InputError(f"{parcel}: its coordinates are local, and a register has rows on the globe: give it a CRS")
     return _Product(parcel, str(record.get("survey") or parcel), str(record["flown"])[:10], rows)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import shapely
 
-from vinemap import __version__, paths
+from vinemap import __version__, naming, paths
 from vinemap.cloud.files import cloud_files, date_of, shows_tops
 from vinemap.cloud.formats.identity import digest_of, stamp_of
 from vinemap.config.settings import Settings
@@ -80,7 +80,7 @@ def read_source(path: Path, known: Iterable[Source] = ()) -> Source:
     BusyError
         If it changes meanwhile.
     """
-    if (shown := paths.shown(path)) != str(path):
+    if (shown := naming.shown(path)) != str(path):
         raise InputError(f"{shown}: its name isn't Unicode: rename it")
     began, stamp = time.time(), _stamp(path)
     for source in known:

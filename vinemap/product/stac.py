@@ -22,7 +22,7 @@ from pystac import Asset, Link, MediaType, RelType
 from pystac.extensions.file import FileExtension
 from pystac.extensions.projection import ProjectionExtension
 
-from vinemap import __version__, paths
+from vinemap import __version__, naming, paths
 from vinemap.cloud.files import CLOUDS
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.evaluate.unmapped import TALL
@@ -118,7 +118,7 @@ def parcel_item(
     if (page := paths.report(folder, parcel)).exists():
         item.add_asset("report", _asset(page, folder, "Map, table, plots and canopies in 3D", role="overview"))
     for path in sorted(folder.glob("*.tif")):
-        kind = path.stem.removeprefix(f"{paths.safe(parcel)}_")
+        kind = path.stem.removeprefix(f"{naming.safe(parcel)}_")
         _add_raster(item, kind, path)
         if (style := paths.raster_style(path)).exists():
             item.add_asset(f"{kind}_style", _asset(style, folder, "Its colours in QGIS", role="style"))
@@ -147,7 +147,7 @@ def _asset(path: Path, folder: Path, title: str | None, *, role: str = "data") -
 
 
 def _href(path: Path, folder: Path) -> str:
-    if url := paths.url_of(path):
+    if url := naming.url_of(path):
         return url
     try:
         relative = RESERVED.sub(lambda found: quote(found[0]), Path(os.path.relpath(path, folder)).as_posix())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from vinemap import paths
+from vinemap import naming
 from vinemap.cloud.formats.e57 import read_e57
 from vinemap.cloud.formats.ept import read_ept
 from vinemap.cloud.formats.kinds import kind_of
@@ -71,7 +71,7 @@ def other_chunks(
 
 def _named(path: Path) -> Path:
     """A path as it is written in a sentence."""
-    return cast("Path", paths.Address(path.as_posix())) if paths.url_of(path) else path
+    return cast("Path", naming.Address(path.as_posix())) if naming.url_of(path) else path
 
 
 def _with_box(points: Points, first: Floats) -> Header:

@@ -6,7 +6,7 @@ import hashlib
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.formats.remote import Ranges
 
@@ -24,7 +24,7 @@ def stamp_of(path: Path) -> tuple[int, ...]:
     VinemapError
         If a server doesn't give it.
     """
-    if paths.url_of(path):
+    if naming.url_of(path):
         file = Ranges(path)
         when = parsedate_to_datetime(file.modified).timestamp() if file.modified else 0
         number = int.from_bytes(hashlib.sha256(file.tag.encode() + file.beginning).digest()[:7], "big")
@@ -48,7 +48,7 @@ def digest_of(path: Path) -> str:
     VinemapError
         If a server doesn't give it.
     """
-    if paths.url_of(path):
+    if naming.url_of(path):
         file = Ranges(path)
         told = f"{file.url} {file.size} {file.tag} {file.modified}".encode()
         return hashlib.sha256(told + file.beginning).hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinemap import paths
+from vinemap import naming, paths
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +24,7 @@ IN_FOLDERS = tuple(kind for kind in KINDS if kind not in MINGLED)
 
 def kind_of(path: Path) -> str | None:
     """Format of a file other than LAS, LAZ and COPC on a disk; None of those, and of what can't be told."""
-    if paths.url_of(path):
+    if naming.url_of(path):
         return "remote"
     if path.name.lower() == paths.EPT:
         return "ept"

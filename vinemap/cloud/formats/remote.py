@@ -11,7 +11,7 @@ from urllib.request import Request, urlopen
 
 import numpy as np
 
-from vinemap import paths
+from vinemap import naming
 from vinemap.cloud.copc import is_copc
 from vinemap.cloud.formats.box import box_about
 from vinemap.cloud.formats.told import CHUNK, Points, needed, reading, usable_records
@@ -54,7 +54,7 @@ class Ranges(io.RawIOBase):
 
     def __init__(self, path: Path) -> None:
         """Fetch its beginning; errors are those of :meth:`fetch`."""
-        self.url = str(paths.url_of(path))
+        self.url = str(naming.url_of(path))
         self.size, self.tag, self.modified, self.at = 0, "", "", 0
         self.beginning = b""
         self.beginning = self.fetch(0, BEGINNING)
