@@ -11,7 +11,7 @@ from systems import POSIX
 from vinemap import paths
 from vinemap.config.names import check_name
 from vinemap.errors import OutputError
-from vinemap.paths import LONGEST_NAME, MOST_BYTES
+from vinemap.naming import LONGEST_NAME, MOST_BYTES
 from vinemap.product import store
 
 
