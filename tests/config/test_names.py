@@ -5,7 +5,7 @@ import pytest
 from vinemap.config.names import check_name, check_parcel
 from vinemap.config.surveys import choose_parcel, load_survey
 from vinemap.errors import ConfigError
-from vinemap.paths import safe
+from vinemap.naming import safe
 
 
 @pytest.mark.parametrize(
