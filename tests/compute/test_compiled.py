@@ -59,6 +59,7 @@ def ask(package, **environment):
     """What the function answers in a process of its own, whether it was kept, and numba's own setting."""
     known = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
     known |= {"PYTHONPATH": str(package.parent), "HOME": str(package.parents[1] / "home")} | environment
+    known["PYTHONDONTWRITEBYTECODE"] = "1"  # bytecode is taken for a source of the same second and size
     done = subprocess.run(
         [sys.executable, "-c", ASK], env=known, cwd=package.parents[1], capture_output=True, text=True, check=False
     )
