@@ -15,7 +15,6 @@ import trimesh
 from click.testing import CliRunner
 
 from vinemap import paths
-from vinemap.chain import STAGES, call
 from vinemap.cli.main import commands
 from vinemap.config.settings import Settings
 from vinemap.errors import InputError, OutputError
@@ -30,6 +29,7 @@ from vinemap.simulate.rays import Obstacle
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate, write_survey
 from vinemap.simulate.terrain import hillside
+from vinemap.stages import STAGES, call
 
 RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 

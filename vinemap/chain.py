@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.canopy.model import CanopyModel, find_canopies, model_sections
 from vinemap.compute import machine
@@ -18,6 +18,7 @@ from vinemap.rows.fit import fit_rows
 from vinemap.rows.key_points import detect_key_points
 from vinemap.rows.known import follow_lines, name_rows
 from vinemap.rows.numbers import count_missing, number_rows
+from vinemap.stages import call
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.lines import lines_here, space_lines
 from vinemap.surfaces.map import map_surfaces
@@ -32,17 +33,6 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
     from vinemap.surfaces.seen import Seen
     from vinemap.surfaces.waves import RowField
-
-T = TypeVar("T")
-
-STAGES: tuple[str, ...] = ("Reading", "DTM", "Canopy cover", "Row field", "Key points", "Clusters", "Curves")
-STAGES += ("Ends and gaps", "Sections", "Canopy", "Vines", "Mesh", "Unmapped", "Writing")
-
-
-def call(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
-    """Run a stage as it is."""
-    del name
-    return function(*args, **kwargs)
 
 
 class RowMap(NamedTuple):

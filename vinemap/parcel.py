@@ -3,40 +3,21 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from datetime import UTC, datetime
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinemap import paths
-from vinemap.canopy.classification import classify_points
-from vinemap.canopy.mesh import section_meshes
-from vinemap.canopy.model import find_leaves
-from vinemap.canopy.numbers import as_seen, judge_canopies, summarise_rows
-from vinemap.chain import call, map_rows, model_canopies
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal import check_engine, read_cloud_pdal
 from vinemap.cloud.pieces import read_piece
-from vinemap.cloud.tiles import Collector, moved
-from vinemap.cloud.write import write_classified
+from vinemap.cloud.tiles import Collector
 from vinemap.compute import machine
-from vinemap.compute.threads import aside
 from vinemap.config.names import check_parcel
-from vinemap.evaluate.trunks import vines_in_rows
-from vinemap.evaluate.unmapped import find_unmapped
-from vinemap.evaluate.vines import find_vines
-from vinemap.geo.crs import project
-from vinemap.geo.main import check_near, corner_of
+from vinemap.geo.main import check_near
 from vinemap.product import store
-from vinemap.product.layers import labelled, parcel_layer
-from vinemap.product.rasters import rasters_of, write_rasters
 from vinemap.product.recipe import Recipe, recipe_of
-from vinemap.product.record import Summary, record_of
-from vinemap.product.stac import write_item
-from vinemap.product.write import write_product
-from vinemap.rows.ends import beyond_ends
-from vinemap.rows.numbers import describe_rows
+from vinemap.stages import call
 from vinemap.surfaces.statistics import block_side
 
 if TYPE_CHECKING:
@@ -49,6 +30,7 @@ if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.config.settings import Settings
     from vinemap.geo.main import Origin
+    from vinemap.product.record import Summary
 
 T = TypeVar("T")
 
@@ -136,7 +118,7 @@ def follow(
     step : callable
         As for :func:`map_parcel`; the same errors are raised.
     """
-    parcel, settings, origin = recipe.parcel, recipe.settings, recipe.origin
+    settings, origin = recipe.settings, recipe.origin
     check_engine(settings.ground.engine)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
@@ -147,54 +129,15 @@ def follow(
         seconds[name] = round(time.perf_counter() - start, 3)
         return out
 
-    with store.product(folder, drafts=drafts, within=within) as draft, aside() as beside:
+    with store.product(folder, drafts=drafts, within=within) as draft:
         points = _read(recipe, piece, draft, run)
         if origin:
             check_near(origin, points.extent[0], points.crs)
-        polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
-        known, shift = recipe.known.lines if recipe.known else None, None
-        if known is not None and settings.rows.align and (shift := map_rows(points, settings, known=known).shift):
-            points = moved(points, -shift.metres, _collector(settings, paths.tiles(draft) / "moved"))
-        found = map_rows(points, settings, within=polygon, known=known, step=run)
-        shift, surfaces = shift or found.shift, (found.dtm, found.chm)
-        written = beside(write_rasters, draft, parcel, rasters := rasters_of(*surfaces, found.field))
-        model, apart, high = model_canopies(found, settings, step=run), settings.sections.step, settings.cover.high
-        main = origin or corner_of(found.dtm)
-        rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
-        rows, table = as_seen(rows, model.table, tops=recipe.tops)
-        rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
-        standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
-        given = settings.missing.model_dump() | {"step": apart, "known": standing}
-        rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
-        meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
-        outlines = parcel_layer(parcel, rows, polygon, points)
-        layers = {
-            "rows": rows,
-            "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
-            "key_points": enhanced,
-            "sections": labelled(table, rows),
-            "gaps": labelled(gaps, rows),
-            "vines": labelled(vines, rows),
-            "unmapped": run("Unmapped", find_unmapped, found.chm, rows, outlines if polygon else None, tallest=high),
-            "parcel": outlines,
-        }
-        about: dict[str, Any] = {"origin": main, "shift": shift, "square": found.field.square}
-        about |= {"n_key_points": found.n_key_points, "remarks": [*found.remarks, *strays]}
-        record = record_of(recipe, found.cloud, layers, surfaces, **about)
+        from vinemap.making import make_product  # half a second of start-up, for what could be read
+        from vinemap.product.record import Summary
 
-        def write() -> list[str]:
-            how = settings.product.model_dump(include={"plain", "geoid"})
-            remarks = write_product(draft, record, layers, rasters, meshes, points, **how)
-            if settings.product.classified:
-                cut = found.cloud, found.rows, found.gaps, found.dtm
-                classify = partial(classify_points, leaves=find_leaves(*cut, settings))
-                write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
-            written.result()
-            return remarks
-
-        record["warnings"] += run("Writing", write)
-        shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-        write_item(draft, recipe, record, layers["parcel"])
+        aligned = _collector(settings, paths.tiles(draft) / "moved")
+        record = make_product(recipe, points, draft, aligned=aligned, run=run)
         record |= {
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},
@@ -202,7 +145,7 @@ def follow(
         }
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False), encoding="utf-8")
     length, took = record["length_m"], time.perf_counter() - began
-    return Summary(parcel, folder, len(rows), length, took, tuple(record["warnings"]))
+    return Summary(recipe.parcel, folder, record["counts"]["rows"], length, took, tuple(record["warnings"]))
 
 
 def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:

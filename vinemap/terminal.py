@@ -45,7 +45,7 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
         task = bar.add_task("Starting", total=None, parcel=parcel)
 
         def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            from vinemap.chain import STAGES
+            from vinemap.stages import STAGES
 
             bar.update(task, description=name, total=len(STAGES), completed=STAGES.index(name))
             return function(*args, **kwargs)

@@ -14,7 +14,7 @@ from pyproj import CRS
 from systems import POSIX
 
 from vinemap import paths
-from vinemap.chain import call, map_rows, model_canopies
+from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.las import collected
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector, TiledCloud
@@ -25,6 +25,7 @@ from vinemap.geo.raster import grid_over, squares, window
 from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb
 from vinemap.simulate.survey import write_survey
+from vinemap.stages import call
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
 from vinemap.surfaces.statistics import block_side

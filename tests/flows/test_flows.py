@@ -11,9 +11,9 @@ from commands import ROOT, assert_refused, free_of_prefect, python
 from drives import images, poses
 from place import Place
 
-from vinemap.chain import STAGES
 from vinemap.simulate.camera import LOW
 from vinemap.simulate.survey import write_survey
+from vinemap.stages import STAGES
 
 NIGHTLY = """
 from pathlib import Path

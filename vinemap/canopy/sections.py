@@ -92,8 +92,7 @@ def cut_sections(
         start = np.concatenate([[0], np.cumsum(n)])
         here = at(curves[row], position)
         level = sample(dtm, here)
-        points = np.empty((start[-1], 2))
-        _fill(index, left, elevation, start, level, points)
+        points, heights, members = _take_each(index, left, elevation, height, member, start, level)
         return then(
             Sections(
                 np.full(len(position), numbers[row]),
@@ -103,8 +102,8 @@ def cut_sections(
                 np.full(len(position), spacing[row]),
                 start,
                 points,
-                height[index],
-                member[index],
+                heights,
+                members,
             )
         )
 
@@ -208,18 +207,24 @@ def _list_members(
 
 
 @compiled
-def _fill(
+def _take_each(
     index: NDArray[np.int32],
     left: Values,
     elevation: Values,
+    height: Values,
+    member: NDArray[np.int32],
     start: Ints,
     level: Values,
-    points: Values,
-) -> None:
-    """Write the points (n, 2) of sections whose soil lies at ``level`` (m,)."""
+) -> tuple[Values, Values, NDArray[np.int32]]:
+    """Points (n, 2) of sections whose soil lies at ``level`` (m,), their heights, and which of the cloud's they are."""
+    n = len(index)
+    points, heights, members = np.empty((n, 2)), np.empty(n, height.dtype), np.empty(n, member.dtype)
     for k in range(len(level)):
         for i in range(start[k], start[k + 1]):
-            points[i, 0], points[i, 1] = left[index[i]], elevation[index[i]] - level[k]
+            p = index[i]
+            points[i, 0], points[i, 1] = left[p], elevation[p] - level[k]
+            heights[i], members[i] = height[p], member[p]
+    return points, heights, members
 
 
 def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import click
 
 from vinemap import __version__
@@ -32,3 +34,4 @@ def main() -> None:
     """Run a command of the command line."""
     with hushed(), plain_errors():
         commands.main(prog_name="vinemap", standalone_mode=False)
+    gc.freeze()  # the process ends: nothing is looked through for garbage

@@ -80,7 +80,15 @@ def run(
     with progress(name) as bar, ahead(bar) as step:
         with _importing():
             from vinemap.parcel import map_parcel
-        summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
+
+        def stage(name: str, *args: Any, **kwargs: Any) -> Any:
+            out = step(name, *args, **kwargs)
+            if name == "Reading":
+                with _importing():
+                    import vinemap.making  # noqa: F401 - what could be read is worked on next
+            return out
+
+        summary = map_parcel(clouds, folder, parcel=name, step=stage, **options)
     click.echo(summary.line())
 
 

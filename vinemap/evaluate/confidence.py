@@ -9,6 +9,7 @@ import pandas as pd
 import shapely
 from scipy.spatial import cKDTree
 
+from vinemap.compute.beside import nearest_beside
 from vinemap.geo.raster import Raster, sample_across
 
 if TYPE_CHECKING:
@@ -181,26 +182,9 @@ def _stations(lines: Values) -> _Stations:
 
 def _beside(at: _Stations, block: Ints, reach: Values) -> _Beside:
     """The nearest row on both sides of every station, within the metres that rows (n,) of a block reach."""
-    tree, pairs = cKDTree(at.xy), []
-    for one in np.unique(block):
-        mine = np.flatnonzero(block[at.row] == one)
-        wide = float(reach[block == one].max())
-        near = cKDTree(at.xy[mine]).sparse_distance_matrix(tree, wide, output_type="ndarray")
-        i, j = mine[near["i"]], near["j"]
-        others = at.row[i] != at.row[j]
-        i, j = i[others], j[others]
-        along, across = _seen_from(at.xy[i], at.tangent[i], at.xy[j])
-        opposite = np.abs(along) <= 0.75 * STEP
-        opposite &= np.abs((at.tangent[i] * at.tangent[j]).sum(axis=1)) > PARALLEL
-        pairs.append((i[opposite], j[opposite], across[opposite]))
-    i, j, across = (np.concatenate(column) for column in zip(*pairs, strict=True))
-    away, row = np.full((len(at.row), 2), np.inf), np.full((len(at.row), 2), -1)
-    for side, sign in enumerate((1, -1)):
-        mine = np.flatnonzero(sign * across > 0)
-        far_first = mine[np.argsort(-np.abs(across[mine]), kind="stable")]
-        away[i[far_first], side] = np.abs(across[far_first])
-        row[i[far_first], side] = at.row[j[far_first]]
-    return _Beside(away, row)
+    wide = pd.Series(reach).groupby(block).transform("max").to_numpy()[at.row]
+    away, other = nearest_beside(at.xy, at.tangent, at.row, wide, along=0.75 * STEP, parallel=PARALLEL)
+    return _Beside(away, np.where(other >= 0, at.row[other], -1))
 
 
 def _seen_from(xy: Values, tangent: Values, other: Values) -> tuple[Values, Values]:

@@ -9,9 +9,10 @@ import numpy as np
 import shapely
 import shapely.geometry
 from affine import Affine
-from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, find_objects, label
+from scipy.ndimage import binary_dilation, binary_opening, find_objects, label
 from scipy.spatial import cKDTree
 
+from vinemap.compute.filters import distance_to
 from vinemap.geo.raster import Grid, Raster, block_sum, coarser
 from vinemap.surfaces.cover import WIDEST
 from vinemap.surfaces.statistics import LOWEST
@@ -175,7 +176,7 @@ def _around(chm: Raster, away: Floats, *, margin: float) -> tuple[Raster, Floats
 def _places(chm: Raster, away: Floats, usual: Usual, tallest: float) -> list[dict[str, Any]]:
     """What stands in no row, a polygon each of one kind."""
     cell, left = chm.grid.resolution, ~np.isnan(away)
-    depth = distance_transform_edt(left) * cell
+    depth = distance_to(~left) * cell
     tall, wide, narrow = _kinds(chm, left, depth, usual, tallest)
     narrow = _without_specks(narrow, max(SPECK, round(usual.width / cell)))
     closed = _closed(narrow, usual.spacing / 2 / cell)
@@ -183,7 +184,7 @@ def _places(chm: Raster, away: Floats, usual: Usual, tallest: float) -> list[dic
     found = []
     for reason, own, area in ((TALL, tall, tall), (WIDE, wide, wide), (None, narrow, closed)):
         places, _ = label(area, None if reason else CORNERS)
-        room = distance_transform_edt(area) * cell if reason is None else depth
+        room = distance_to(~area) * cell if reason is None else depth
         for k, window in enumerate(find_objects(places), start=1):
             place = places[window] == k
             stand = own[window] & place
@@ -226,7 +227,7 @@ def _kinds(chm: Raster, left: Flags, depth: Floats, usual: Usual, tallest: float
 
 def _near(mask: Flags, reach: float) -> Flags:
     """Cells within a reach in cells of those of a mask."""
-    out: Flags = distance_transform_edt(~mask) <= reach if mask.any() else mask
+    out: Flags = distance_to(mask) <= reach if mask.any() else mask
     return out
 
 
@@ -234,7 +235,7 @@ def _closed(mask: Flags, reach: float) -> Flags:
     """Cells of a mask and between those that are less than twice a reach in cells apart; its margin is free."""
     if not mask.any():
         return mask
-    out: Flags = mask | (distance_transform_edt(_near(mask, reach)) > reach)
+    out: Flags = mask | (distance_to(~_near(mask, reach)) > reach)
     return out
 
 

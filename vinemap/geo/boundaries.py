@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 import shapely
 
 from vinemap.errors import InputError
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
+    import pandas as pd
     from numpy.typing import NDArray
     from pyproj import CRS
 
@@ -133,11 +133,11 @@ def read_parcels(
         raise InputError(f"{path}: no column has a name of its own for each of its {n} polygons: add one, 'name'")
     found: dict[str, Parcel | InputError] = {}
     column, words = next(iter(table.columns.items()))
-    for row, word in enumerate(words):
-        name = f"polygon {row + 1}" if pd.isna(word) else str(word)
+    for row, (word, unnamed) in enumerate(zip(words, words.isna(), strict=True)):
+        name = f"polygon {row + 1}" if unnamed else str(word)
         if not table.area[row]:
             found.setdefault(name, NoAreaError(f"{_described(table, row)} is no polygon"))
-        elif pd.isna(word):
+        elif unnamed:
             found[name] = InputError(f"{path}: {name} has no name in column {column!r}: give it one")
         else:
             found[name] = _made(table, np.array([row]), path)

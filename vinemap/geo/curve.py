@@ -8,6 +8,8 @@ import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
+from vinemap.compute.compiled import compiled
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -16,8 +18,8 @@ if TYPE_CHECKING:
 
 def at(curve: Values, position: Values) -> Values:
     """Points (m, 2) of a curve (n, 2) at metres (m,) along it; before its start and past its end, its ends."""
-    way = way_along(curve)
-    return np.column_stack([np.interp(position, way, curve[:, k]) for k in (0, 1)])
+    plain = (np.ascontiguousarray(values, dtype=np.float64) for values in (position, way_along(curve), curve))
+    return _placed(*plain)
 
 
 def at_each(curves: Sequence[Values], which: Ints, position: Values) -> Values:
@@ -29,7 +31,27 @@ def at_each(curves: Sequence[Values], which: Ints, position: Values) -> Values:
     way = np.cumsum(way)
     last = way[[*(first[1:] - 1), len(way) - 1]]
     along = way[first][which] + np.clip(position, 0.0, (last - way[first])[which])
-    return np.column_stack([np.interp(along, way, points[:, k]) for k in (0, 1)])
+    return _placed(along, way, np.ascontiguousarray(points, dtype=np.float64))
+
+
+@compiled
+def _placed(position: Values, way: Values, vertices: Values) -> Values:
+    """Points (m, 2) at metres (m,) along, where vertices (n, 2) lie at metres (n,); the ends' beyond them."""
+    n, out = len(way), np.empty((len(position), 2))
+    k = 0
+    for i in range(len(position)):
+        at = position[i]
+        if at < way[k] or (k + 2 < n and at >= way[k + 2]):
+            k = max(np.searchsorted(way, at, "right") - 1, 0)
+        while k + 1 < n and way[k + 1] <= at:
+            k += 1
+        if k + 1 == n or at <= way[k]:
+            out[i, 0], out[i, 1] = vertices[k, 0], vertices[k, 1]
+            continue
+        for axis in range(2):
+            slope = (vertices[k + 1, axis] - vertices[k, axis]) / (way[k + 1] - way[k])
+            out[i, axis] = slope * (at - way[k]) + vertices[k, axis]
+    return out
 
 
 def tangents(curve: Values, position: Values) -> Values:
@@ -46,14 +68,26 @@ def tangents_of_each(curves: Sequence[Values], which: Ints, position: Values) ->
 
 def normals(curve: Values, *, smoothing: float) -> Values:
     """Unit normals (n, 2) to the left of a curve (n, 2), smoothed over so many of its points."""
-    tangent = gaussian_filter1d(np.gradient(curve, axis=0), smoothing, axis=0, mode="nearest")
-    tangent /= np.hypot(*tangent.T)[:, None]
-    return np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    tangent = np.empty_like(curve)
+    tangent[0], tangent[-1] = curve[1] - curve[0], curve[-1] - curve[-2]
+    tangent[1:-1] = (curve[2:] - curve[:-2]) / 2
+    x, y = (gaussian_filter1d(tangent[:, k], smoothing, mode="nearest") for k in (0, 1))
+    length, out = np.hypot(x, y), np.empty_like(curve)
+    out[:, 0], out[:, 1] = -y / length, x / length
+    return out
 
 
 def way_along(curve: Values) -> Values:
     """Metres (n,) from the start of a curve (n, 2) to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(curve, axis=0).T))])
+    return _way(np.ascontiguousarray(curve, dtype=np.float64))
+
+
+@compiled
+def _way(curve: Values) -> Values:
+    way = np.zeros(len(curve))
+    for k in range(1, len(curve)):
+        way[k] = way[k - 1] + np.hypot(curve[k, 0] - curve[k - 1, 0], curve[k, 1] - curve[k - 1, 1])
+    return way
 
 
 def extend(curve: Values, by: float) -> Values:

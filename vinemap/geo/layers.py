@@ -6,10 +6,7 @@ import warnings
 import zipfile
 from typing import TYPE_CHECKING, NamedTuple
 
-import geopandas as gpd
 import numpy as np
-import pandas as pd
-import pyogrio
 import shapely
 
 from vinemap.errors import InputError
@@ -19,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    import geopandas as gpd
+    import pandas as pd
     from pyproj import CRS
     from shapely.geometry.base import BaseGeometry
 
@@ -43,6 +42,8 @@ class Layer(NamedTuple):
 
     def read(self) -> gpd.GeoDataFrame:
         """What it holds."""
+        import geopandas as gpd  # a quarter of a second of start-up, needed for people's files only
+
         return gpd.read_file(self.source, layer=self.name)
 
 
@@ -77,6 +78,9 @@ def read_layers(
     InputError
         If it can't be read, or has no CRS.
     """
+    import geopandas as gpd
+    import pandas as pd
+
     if path.is_dir():
         raise InputError(f"{path}: is a folder: name the file of {things} in it")
     if not path.is_file():
@@ -113,6 +117,7 @@ def read_points(path: Path, things: str, *, crs: CRS | None = None, local: bool 
     InputError
         If the file can't be read, has no CRS or no point, or more than one layer that may be meant.
     """
+    import geopandas as gpd
 
     def choose(layers: Sequence[Layer]) -> Sequence[Layer]:
         named = [layer for layer in layers if layer.name.lower() == things]
@@ -135,6 +140,8 @@ def read_points(path: Path, things: str, *, crs: CRS | None = None, local: bool 
 
 
 def _layers(path: Path, things: str) -> list[Layer]:
+    import pyogrio
+
     if path.suffix.lower() == ".kmz":  # of which GDAL reads one file alone
         sources = [f"/vsizip/{path}/{name}" for name in _names(path, (".kml",))] or [str(path)]
     else:
@@ -182,6 +189,8 @@ def polygons_of(geometry: shapely.Geometry | None) -> list[shapely.Polygon]:
 
 def words_of(column: pd.Series) -> pd.Series:
     """Names as words, their Unicode composed, None where there is none; whole numbers without decimals."""
+    import pandas as pd
+
     if pd.api.types.is_float_dtype(column):
         known = column.dropna()
         column = column.astype("Int64") if ((known % 1 == 0) & (known.abs() < WHOLE)).all() else column

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
-from scipy.ndimage import binary_dilation
 
 from vinemap.compute.compiled import compiled
 from vinemap.geo.raster import Grid, cell_at, window
@@ -37,6 +36,8 @@ class Zones(NamedTuple):
 
 def zones_of(polygons: Sequence[shapely.Geometry]) -> Zones:
     """Zones of polygons with finite coordinates in metres; they may overlap."""
+    from scipy.ndimage import binary_dilation  # a tenth of a second of start-up, where there are polygons
+
     shapely.prepare(np.array(polygons))
     west, south, east, north = shapely.total_bounds(np.array(polygons))
     cell = max(CELL, float(np.sqrt((east - west) * (north - south) / MOST_CELLS)))

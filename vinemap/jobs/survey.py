@@ -13,7 +13,6 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import paths
-from vinemap.chain import call
 from vinemap.cloud.files import worded
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
@@ -26,6 +25,7 @@ from vinemap.product.globe import survey_tileset
 from vinemap.product.pages.survey import write_index
 from vinemap.product.stac import write_collection
 from vinemap.product.store import unwritable, workshop, write_whole
+from vinemap.stages import call
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

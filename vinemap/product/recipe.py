@@ -19,7 +19,6 @@ from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import points_near, read_parcel
 from vinemap.geo.crs import is_local
 from vinemap.geo.layers import read_points, some_of
-from vinemap.geo.lines import read_rows, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -235,6 +234,8 @@ def recipe_of(
     sources += (read_source(boundary),) if boundary else ()
     known = None
     if rows:
+        from vinemap.geo.lines import read_rows, rows_of
+
         sources += (read_source(rows),)
         found, outside = rows_of(read_rows(rows, crs=rows_crs, local=local), {parcel: polygon})
         if parcel not in found:

@@ -73,7 +73,8 @@ def outline_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     polygons, blocks = [], []
     for block, members in rows.groupby("block"):
         half = 0.5 * members["spacing_m"].to_numpy()
-        strips = shapely.buffer(shapely.force_2d(members.geometry.to_numpy()), half, cap_style="flat")
+        lines = shapely.simplify(shapely.force_2d(members.geometry.to_numpy()), SLACK)
+        strips = shapely.buffer(lines, half, cap_style="flat")
         closed = shapely.buffer(shapely.union_all(strips), half.max(), join_style="mitre")
         closed = shapely.buffer(closed, -half.max())
         parts = [shapely.Polygon(part.exterior) for part in shapely.get_parts(closed)]

@@ -21,6 +21,7 @@ from scipy.ndimage import (
 )
 from scipy.spatial import cKDTree
 
+from vinemap.compute.beside import nearest_beside
 from vinemap.compute.links import parts_of
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
@@ -317,18 +318,8 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
 
 def _spacing_beside(here: Values, chord: Values, row: Ints, expected: Values) -> Values:
     """Mean distance in metres (n,) from points of rows to the rows on both sides, NaN where there is none."""
-    if len(here) == 0:
-        return np.empty(0)
     way = chord / np.hypot(*chord.T)[:, None]
-    pairs = cKDTree(here).query_pairs(1.8 * float(expected.max()), output_type="ndarray")
-    pairs = pairs[row[pairs[:, 0]] != row[pairs[:, 1]]]
-    near, there = np.concatenate([pairs, pairs[:, ::-1]]).T
-    offset = here[there] - here[near]
-    along = (offset * way[near]).sum(axis=1)
-    left = way[near, 0] * offset[:, 1] - way[near, 1] * offset[:, 0]
-    beside = (np.abs(along) <= 0.75) & (np.abs(left) > 0.3) & (np.hypot(along, left) <= 1.8 * expected[near])
-    sides = np.full((2, len(here)), np.inf)
-    np.minimum.at(sides, ((left > 0).astype(int)[beside], near[beside]), np.abs(left[beside]))
+    sides, _ = nearest_beside(here, way, row, 1.8 * expected, along=0.75, apart=0.3)
     reached = np.isfinite(sides)
-    n = reached.sum(axis=0)
-    return np.where(n > 0, np.where(reached, sides, 0).sum(axis=0) / np.maximum(n, 1), np.nan)
+    n = reached.sum(axis=1)
+    return np.where(n > 0, np.where(reached, sides, 0).sum(axis=1) / np.maximum(n, 1), np.nan)

@@ -8,6 +8,7 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
+from vinemap.compute.threads import in_threads
 from vinemap.geo.crs import WGS84, is_local, to_wgs84
 from vinemap.geo.main import Corner, Origin, to_main
 from vinemap.rows.ends import UNSEEN, USUAL
@@ -119,15 +120,20 @@ def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
     peak isn't clear.
     """
     frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
-    power, spread = np.zeros(len(frequency)), 0.0
+    places: list[Floats] = []
     row, hidden = gaps["row_id"].to_numpy(), (gaps["state"] == UNSEEN).to_numpy(dtype=bool)
     # A number for each place of each row.
     start, end = (row + 1j * gaps[edge].to_numpy(dtype=float) for edge in ("start_m", "end_m"))
     for edge, other in ((start, end), (end, start)):
         told = np.sort_complex(edge[~hidden & ~np.isin(edge, other[hidden])])
-        for at in np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1):
-            power += np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
-            spread += len(at) * (len(at) - 1)
+        places += np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1)
+    spread = sum(len(at) * (len(at) - 1) for at in places)
+
+    def periodogram(at: Floats) -> Floats:
+        out: Floats = np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
+        return out
+
+    power = np.sum(in_threads(periodogram, places), axis=0)
     # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
     clear = spread > 0 and power.max() > 5 * np.sqrt(spread)
     return float(1 / frequency[power.argmax()]) if clear else None

@@ -9,6 +9,7 @@ from scipy.ndimage import find_objects, label
 from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
+from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import sample_across
 
 if TYPE_CHECKING:
@@ -84,11 +85,15 @@ def on_tracks(gaps: Gaps, xy: Values, *, track_width: float, cover: Raster | Non
     covers = common >= COVERED * gaps.length[other]
     linked = covers & (gaps.length[one] <= LONGER * gaps.length[other])
     lanes = parts_of(len(wide), one[linked], other[linked])
-    for k in range(lanes.max() + 1):
+
+    def on_track(k: int) -> Ints:
         lane = np.union1d(np.flatnonzero(lanes == k), one[covers & (lanes[other] == k)])
-        if _leads_out(tree, gaps, lane, track_width):
-            posts = _with_posts(gaps, lane, cover) if cover is not None else 0
-            out[wide[lane]] |= posts < max(min(2, len(lane)), POSTED * len(lane))
+        if not _leads_out(tree, gaps, lane, track_width):
+            return lane[:0]
+        posts = _with_posts(gaps, lane, cover) if cover is not None else 0
+        return lane if posts < max(min(2, len(lane)), POSTED * len(lane)) else lane[:0]
+
+    out[wide[np.concatenate(in_threads(on_track, range(lanes.max() + 1)))]] = True
     return out
 
 

@@ -20,6 +20,7 @@ from scipy.ndimage import (
     uniform_filter,
 )
 
+from vinemap.compute.filters import distance_to
 from vinemap.geo.raster import Raster, cells_in, coarser
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.statistics import LOWEST, height_about
@@ -104,11 +105,11 @@ def _nets(chm: Raster) -> Values:
     if np.count_nonzero(flat) * cell**2 < CLOSED * WIDE**2:
         return np.zeros(chm.grid.shape)
     closed = uniform_filter(flat.astype(np.float32), max(1, round(MESH / cell))) >= CLOSED
-    middle = distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1] * cell > WIDE / 2
+    middle = distance_to(~np.pad(closed, 1))[1:-1, 1:-1] * cell > WIDE / 2
     if not middle.any():
         return np.zeros(chm.grid.shape)
     # What is closed ends before the corners and a ragged edge do.
-    return np.where(flat & (distance_transform_edt(~middle) * cell <= WIDE), height, 0.0)
+    return np.where(flat & (distance_to(middle) * cell <= WIDE), height, 0.0)
 
 
 def _in_cells(heights: Values, grid: Grid) -> Values:
@@ -154,7 +155,7 @@ def _cover_crops(chm: Raster, high: float) -> Flags:
 def _parts(mask: Flags) -> tuple[Ints, Values, Values, Values]:
     """Numbers (ny, nx) of the parts that hang together, their width and length (n + 1,), and cells' depth, in cells."""
     parts = label(mask, CORNERS)[0]
-    depth = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    depth = distance_to(~np.pad(mask, 1))[1:-1, 1:-1]
     n = np.maximum(np.bincount(parts.ravel()), 1)
     # Cells are 1, 2, …, 2, 1 deep across a part, of which those at both edges are canopy in half.
     width = 4 * np.bincount(parts.ravel(), depth.ravel()) / n - 3

@@ -10,12 +10,12 @@ from scipy.ndimage import (
     binary_dilation,
     binary_erosion,
     binary_opening,
-    distance_transform_edt,
     gaussian_filter,
     uniform_filter,
 )
 
 from vinemap.compute.compiled import compiled
+from vinemap.compute.filters import distance_to
 from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
 from vinemap.surfaces.statistics import LOWEST, height_about
@@ -276,7 +276,7 @@ def _grown(cells: Flags, radius: float, side: float) -> Flags:
     """Cells, and those within some metres of them."""
     if not cells.any():
         return cells
-    out: Flags = distance_transform_edt(~cells, side) <= radius
+    out: Flags = distance_to(cells) * side <= radius
     return out
 
 
