@@ -42,8 +42,8 @@ def test_points_on_a_line_have_none_beside_them():
     assert [len(part) for part in none] == [0, 0]
 
 
-def test_beside_what_has_no_direction_is_nothing():
-    xy, way = np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[np.nan, np.nan], [1.0, 0.0]])
-    away, _ = nearest_beside(xy, way, np.arange(2), np.full(2, 3.0), along=0.5)
-    assert np.isinf(away[0]).all()
-    assert away[1].tolist() == [np.inf, 1.0]
+def test_what_has_no_direction_is_beside_nothing():
+    xy, way = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]), np.array([[np.nan, np.nan], [1.0, 0.0], [1.0, 0.0]])
+    away, which = nearest_beside(xy, way, np.arange(3), np.full(3, 3.0), along=0.5)
+    assert away.tolist() == [[np.inf, np.inf], [1.0, np.inf], [np.inf, 1.0]]
+    assert which.tolist() == [[-1, -1], [2, -1], [-1, 1]]

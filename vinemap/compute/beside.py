@@ -21,7 +21,7 @@ def nearest_beside(
     Parameters
     ----------
     xy, way : array (n, 2)
-        Points, and the unit vectors in which their lines run there; beside NaN there is nothing.
+        Points, and the unit vectors in which their lines run there; what has NaN is beside nothing.
     line : array (n,)
         Whose point it is.
     reach : array (n,)
