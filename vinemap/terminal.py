@@ -37,7 +37,14 @@ def frame_progress(frames: Iterable[T], count: int | None) -> Iterator[T]:
 
 @contextmanager
 def progress(parcel: str) -> Iterator[Callable[..., Any]]:
-    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr."""
+    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr.
+
+    With ``VINEMAP_PROGRESS=1`` it writes a line a stage instead (``5/14 Key points``), for programs that show it
+    themselves.
+    """
+    if os.environ.get("VINEMAP_PROGRESS"):
+        yield _told
+        return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     columns = TextColumn("{task.fields[parcel]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
@@ -51,6 +58,13 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
             return function(*args, **kwargs)
 
         yield step
+
+
+def _told(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    from vinemap.chain import STAGES
+
+    click.echo(f"{STAGES.index(name)}/{len(STAGES)} {name}", err=True)
+    return function(*args, **kwargs)
 
 
 def show(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -12,7 +12,9 @@ import pytest
 import shapely
 from commands import assert_refused, vinemap
 
+from vinemap.chain import STAGES
 from vinemap.simulate.survey import write_survey
+from vinemap.terminal import progress
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +132,10 @@ def test_faults_are_one_line_too(tmp_path):
     environment["VINEMAP_TRACEBACK"] = "1"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert "Traceback" in done.stderr
+
+
+def test_programs_are_told_the_stages_in_lines(monkeypatch, capsys):
+    monkeypatch.setenv("VINEMAP_PROGRESS", "1")
+    with progress("A") as step:
+        assert step("DTM", max, 1, 2) == 2
+    assert capsys.readouterr().err == f"1/{len(STAGES)} DTM\n"
