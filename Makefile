@@ -48,8 +48,8 @@ nightly: $(READY) ## Map what needs it, every night: make nightly [CONFIG=config
 test: $(READY) ## Run the tests, two files at once
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis
-	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py
+test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis, and call vinemap from it
+	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py tests/plugin/test_qgis.py
 
 test-installed: $(READY) ## Install vinemap by pip outside of this folder, and map with it (needs a package index)
 	@VINEMAP_TEST_INSTALLED=1 $(BIN)/python -m pytest -n 0 tests/test_installed.py

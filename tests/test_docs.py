@@ -41,7 +41,7 @@ def test_commands_exist(page):
     code = "\n".join(re.findall(r"```sh\n(.*?)```", written, re.DOTALL) + re.findall(r"`([^`\n]+)`", written))
     verbs = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     assert set(re.findall(r"^make ([a-z-]+)", code, re.MULTILINE)) <= verbs
-    for name, line in re.findall(r"^(?:\.venv/bin/)?vinemap ([a-z]+)(.*)", code, re.MULTILINE):
+    for name, line in re.findall(r"^(?:\.venv/bin/)?vinemap ([a-z][a-z-]*)(.*)", code, re.MULTILINE):
         assert name in commands.commands
         options = {flag for option in commands.commands[name].params for flag in option.opts}
         assert set(re.findall(r"--[a-z-]+", line.split("#")[0])) <= options

@@ -33,6 +33,7 @@ ROOMS = [
     "parcel",
     "warm",
     "jobs",
+    "plugin",
     "terminal",
     "simulate",
     "example",
@@ -49,6 +50,7 @@ STAGES = {
 }
 """Steps of the chain: what two of them need lies in a file of its own."""
 ONLY_IN = {"prefect": "flows", "distributed": "jobs", "dask": "jobs", "pdal": "cloud"}
+ONLY_IN |= {"qgis": "plugin", "processing": "plugin"}
 """Libraries that one room alone imports."""
 NAMERS = {"paths", "simulate", "measure"}
 """Rooms that write names of files: `paths`, and tools of development."""

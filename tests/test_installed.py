@@ -69,6 +69,8 @@ def test_the_wheel_is_one_package_with_all_that_it_needs(wheel):
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"vinemap"}
     flows = {path.name for path in (ROOT / "flows").glob("*.py")}
     assert flows <= {name.removeprefix("vinemap/flows/") for name in names}
+    plugin = {path.name for path in paths.PLUGIN.iterdir() if path.is_file()}
+    assert plugin == {name.removeprefix("vinemap/plugin/qgis/") for name in names if "/plugin/qgis/" in name}
     assert [name for name in names if "__pycache__" in name or "node_modules" in name] == []
 
 

@@ -8,6 +8,7 @@ What a notebook needs is here and loaded at its first use; everything else is im
     surfaces, rows, canopy        chapters 2 and 3 of the thesis, a stage a file
     evaluate, product, odometry   how good a map is; what a run leaves; chapter 4
     export, parcel, jobs          other programs' formats; the chain, once; many parcels and surveys
+    plugin                        what calls vinemap from QGIS, and puts it there
     terminal, simulate, example   what people see in one; vineyards of known truth; that which comes with vinemap
     flows, cli, measure           the chain as flows of Prefect; the command line; accuracy and speed
 

@@ -33,6 +33,10 @@ TRACK = Path("track.gpkg")
 """Track of a robot, where nobody says otherwise."""
 QGIS_PROJECT = "project.qgs"
 """The project in a ``.qgz``."""
+PLUGIN, PLUGIN_ZIP = Path(__file__).parent / "plugin" / "qgis", Path("vinemap_qgis.zip")
+"""Files of the QGIS plugin, and what they are packed into where nobody says otherwise."""
+PLUGIN_ABOUT, PLUGIN_COMMAND = "metadata.txt", "command.txt"
+"""Files of it that tell QGIS what it is, and it where vinemap is."""
 MATERIALS, MODEL, MODEL_CONFIG = "vineyard.mtl", "model.sdf", "model.config"
 """Files of a model of Gazebo."""
 EXAMPLE = Path("configs/barolo.yaml")

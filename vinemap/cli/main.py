@@ -14,9 +14,9 @@ from vinemap.cli.evaluate import evaluate
 from vinemap.cli.export import export
 from vinemap.cli.register import register
 from vinemap.cli.run import run
+from vinemap.cli.setup import qgis_plugin, warm
 from vinemap.cli.survey import survey
 from vinemap.cli.track import track
-from vinemap.cli.warm import warm
 from vinemap.terminal import hushed, plain_errors
 
 
@@ -26,7 +26,9 @@ def commands() -> None:
     """Vine rows and light canopy meshes from UAV point clouds."""
 
 
-for command in (run, survey, parcel, nightly, register, config, evaluate, export, track, example, warm, doctor):
+for command in (run, survey, parcel, nightly, register, config, evaluate, export, track, example):
+    commands.add_command(command)
+for command in (warm, doctor, qgis_plugin):
     commands.add_command(command)
 
 
