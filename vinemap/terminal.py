@@ -15,6 +15,7 @@ import click
 
 from vinemap.compute.processes import STOPPING
 from vinemap.errors import VinemapError, own_fault
+from vinemap.stages import STAGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -52,8 +53,6 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
         task = bar.add_task("Starting", total=None, parcel=parcel)
 
         def step(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            from vinemap.stages import STAGES
-
             bar.update(task, description=name, total=len(STAGES), completed=STAGES.index(name))
             return function(*args, **kwargs)
 
@@ -61,8 +60,6 @@ def progress(parcel: str) -> Iterator[Callable[..., Any]]:
 
 
 def _told(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    from vinemap.chain import STAGES
-
     click.echo(f"{STAGES.index(name)}/{len(STAGES)} {name}", err=True)
     return function(*args, **kwargs)
 

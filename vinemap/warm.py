@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from vinemap.chain import RowMap
+
 ROWS, LENGTH, SPACING = 6, 24.0, 2.5
 """Of the made-up vineyard: rows, and metres."""
 POINTS = 40_000
-BESIDE = [sys.executable, "-c", "from vinemap.warm import model_canopies_of_none as f; f()"]
+BESIDE = [sys.executable, "-c", "from vinemap.warm import compile_beside as f; f()"]
 """What runs in a process beside this one."""
 
 
@@ -44,19 +47,20 @@ class Warmth(NamedTuple):
 
 
 def warm() -> Warmth:
-    """Compile what isn't kept yet: what models canopies in a process beside this one, all else in this one."""
+    """Compile what isn't kept yet, half of it in a process beside this one."""
     began, folder = time.perf_counter(), compiled.folder()
     before = compiled.kept()
     if folder:
         with _beside() as wait:
-            find_canopies_of_none()
+            found = map_rows_of_none()
             wait()
+        find_canopies_of_none(found)
         model_canopies_of_none()
     return Warmth(folder, len(compiled.kept()), len(compiled.kept() - before), time.perf_counter() - began)
 
 
 @contextmanager
-def ahead(step: Callable[..., Any], *, until: str = "Canopy") -> Iterator[Callable[..., Any]]:
+def ahead(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits, at a stage, for what is compiled meanwhile.
 
     Where something is kept already, all is taken to be.
@@ -76,7 +80,7 @@ def ahead(step: Callable[..., Any], *, until: str = "Canopy") -> Iterator[Callab
 
 @contextmanager
 def _beside() -> Iterator[Callable[[], object]]:
-    """Model canopies of none in a process, which goes with this; gives what waits for it. Without a core for it, none.
+    """Compile in a process that goes with this one; gives what waits for it. Without a core for it, none.
 
     What it couldn't compile is compiled where it is needed, so that its failing is none of ours.
     """
@@ -91,15 +95,24 @@ def _beside() -> Iterator[Callable[[], object]]:
             process.kill()
 
 
-def find_canopies_of_none() -> None:
-    """Find rows of the made-up vineyard, from points that are clipped to a polygon, and what is canopy along them."""
+def compile_beside() -> None:
+    """Compile what the chain comes to last: what smooths the lines of rows, and what models canopies."""
+    import numpy as np
+
+    from vinemap.rows.centre_line import whittaker
+
+    whittaker(np.zeros(40), np.ones(40), cutoff=10.0)
+    model_canopies_of_none()
+    os._exit(0)  # half a second sooner than LLVM lets go
+
+
+def map_rows_of_none() -> RowMap:
+    """Find rows of the made-up vineyard, from points that are clipped to a polygon."""
     import numpy as np
     import shapely
 
-    from vinemap.canopy.model import find_canopies
     from vinemap.chain import map_rows
     from vinemap.cloud.points import PointCloud
-    from vinemap.config.settings import Settings
     from vinemap.geo.crs import parse_crs
     from vinemap.geo.zones import deal, zones_of
 
@@ -109,7 +122,14 @@ def find_canopies_of_none() -> None:
     across, up = _leaves(POINTS).T
     xyz = np.column_stack([x, np.where(leaf, SPACING * draw.integers(0, ROWS, POINTS) + across, y), z + leaf * up])
     around = shapely.box(*xyz[:, :2].min(axis=0) - 1, *xyz[:, :2].max(axis=0) + 1)
-    found = map_rows(PointCloud(deal(xyz, zones_of([around]))[0], parse_crs("EPSG:32632")))
+    return map_rows(PointCloud(deal(xyz, zones_of([around]))[0], parse_crs("EPSG:32632")))
+
+
+def find_canopies_of_none(found: RowMap) -> None:
+    """Tell what is canopy along rows of the made-up vineyard."""
+    from vinemap.canopy.model import find_canopies
+    from vinemap.config.settings import Settings
+
     find_canopies(found.cloud, found.rows, found.gaps, found.dtm, Settings())
 
 

@@ -41,7 +41,7 @@ def compiled(function: F) -> F:
     with _one_at_a_time:  # numba reads where to keep a function when that is decorated, from what all of it shares
         elsewhere, config.CACHE_DIR = config.CACHE_DIR, str(where)
         try:
-            return cast("F", njit(cache=True, nogil=True)(function))
+            return cast("F", njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function))
         finally:
             config.CACHE_DIR = elsewhere
 
