@@ -12,8 +12,8 @@ import pytest
 import shapely
 from commands import assert_refused, vinemap
 
-from vinemap.chain import STAGES
 from vinemap.simulate.survey import write_survey
+from vinemap.stages import STAGES
 from vinemap.terminal import progress
 
 
