@@ -51,8 +51,8 @@ test: $(READY) ## Run the tests, two files at once
 test-qgis: $(READY) ## Open products in the QGIS that is installed, pictures in build/qgis, and call vinemap from it
 	@$(BIN)/python -m pytest -n 0 tests/product/test_qgis.py tests/plugin/test_qgis.py
 
-test-installed: $(READY) ## Install vinemap by pip outside of this folder, and map with it (needs a package index)
-	@VINEMAP_TEST_INSTALLED=1 $(BIN)/python -m pytest -n 0 tests/test_installed.py
+test-installed: $(READY) ## Install vinemap by pip, and by the container's steps, and map with it (needs a package index)
+	@VINEMAP_TEST_INSTALLED=1 $(BIN)/python -m pytest -n 0 tests/test_installed.py tests/test_container.py
 
 check: $(READY) ## Check style, format and types
 	@$(BIN)/python -m ruff check

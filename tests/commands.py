@@ -51,6 +51,11 @@ def free_of_prefect():
     return {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
 
 
+def size(folder):
+    """Bytes of all files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+
+
 def assert_refused(done, *words):
     """One line on stderr that says what was wrong, exit code 2, nothing on stdout."""
     assert done.returncode == 2, done.stderr

@@ -11,7 +11,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
-from commands import ROOT
+from commands import ROOT, size
 
 from vinemap import paths
 from vinemap.compute.extras import EXTRAS
@@ -121,7 +121,3 @@ def test_pip_installs_what_a_map_needs(wheel, tmp_path):
     done = call(python, "-m", "vinemap", "parcel", "F", cwd=tmp_path)
     assert done.stdout.startswith("F: 16 rows, "), done.stderr
     assert (tmp_path / "data" / "products" / "barolo" / "F" / "F.gpkg").is_file()
-
-
-def size(folder):
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())

@@ -68,7 +68,7 @@ def cold(monkeypatch, tmp_path):
 def test_a_stage_waits_for_what_is_compiled_beside(cold):
     with warm.ahead(lambda name, function: function()) as step:
         assert not step("Reading", cold.exists)
-        assert step("Canopy", cold.exists)
+        assert step("Sections", cold.exists)
 
 
 def test_what_is_compiled_beside_ends_with_the_run(cold):
@@ -81,4 +81,4 @@ def test_what_is_compiled_beside_ends_with_the_run(cold):
 def test_on_one_core_all_is_compiled_where_it_is_needed(cold, monkeypatch):
     monkeypatch.setattr(machine, "cores", lambda: 1)
     with warm.ahead(lambda name, function: function()) as step:
-        assert not step("Canopy", cold.exists)
+        assert not step("Sections", cold.exists)
