@@ -15,6 +15,7 @@ from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.tiles import moved
 from vinemap.cloud.write import write_classified
 from vinemap.compute.threads import aside
+from vinemap.evaluate.meshes import measure_meshes
 from vinemap.evaluate.trunks import vines_in_rows
 from vinemap.evaluate.unmapped import find_unmapped
 from vinemap.evaluate.vines import find_vines
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    import geopandas as gpd
+
+    from vinemap.canopy.mesh import Mesh
+    from vinemap.canopy.model import CanopyModel
     from vinemap.cloud.tiles import Cloud, Collector
     from vinemap.product.recipe import Recipe
 
@@ -76,7 +81,7 @@ def make_product(
         standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
         given = settings.missing.model_dump() | {"step": apart, "known": standing}
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
-        meshes = run("Mesh", section_meshes, model.at, model.polygons, rows, step=apart)
+        rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
         outlines = parcel_layer(parcel, rows, polygon, points)
         layers = {
             "rows": rows,
@@ -106,3 +111,11 @@ def make_product(
     shutil.rmtree(paths.tiles(draft), ignore_errors=True)
     write_item(draft, recipe, record, outlines)
     return record
+
+
+def _meshes(
+    cloud: Cloud, model: CanopyModel, rows: gpd.GeoDataFrame, *, step: float, tops: bool
+) -> tuple[gpd.GeoDataFrame, list[Mesh]]:
+    """Rows with how far their canopies' meshes are off, and the meshes."""
+    rows = measure_meshes(cloud, model, rows, step=step, tops=tops)
+    return rows, section_meshes(model.at, model.polygons, rows, step=step)

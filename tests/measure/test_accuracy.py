@@ -13,7 +13,7 @@ from vinemap.chain import RowMap
 from vinemap.geo.raster import Grid, Raster
 from vinemap.measure.accuracy.__main__ import main
 from vinemap.measure.accuracy.family import measure
-from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, table
+from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, COLUMNS, MESH_COLUMNS, table
 from vinemap.measure.accuracy.rows import compare, pool
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.simulate.plants import Vineyard
@@ -197,9 +197,11 @@ def test_a_table_is_filled_between_its_marks():
 
 
 def test_a_family_is_measured_and_drawn(tmp_path):
-    errors, canopy, trust = measure("short", 1, tmp_path)
+    errors, canopy, meshes, trust = measure("short", 1, tmp_path)
     assert len(trust.right) == errors.found
     assert trust.right.sum() == len(errors.pairs) == len(trust.volume)
+    assert len(meshes.told) == errors.found
+    assert "!" not in "".join(table({"short": meshes}, MESH_COLUMNS)[1])
     assert len(canopy.height) == len(errors.pairs)
     assert len(canopy.good) > 200
     assert "–" not in "".join(table({"short": canopy}, CANOPY_COLUMNS)[1])

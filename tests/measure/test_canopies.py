@@ -37,7 +37,8 @@ def model(survey, grown=0.0):
     start = np.arange(0, 4 * m + 1, 4)
     canopy = Sections(foliage.row + 1, position, origin, way, np.full(m, 2.5), start, points, tops, np.arange(4 * m))
     measures = measure_sections(canopy, foliage.bottom, (area, area, area), c=drawn.shape[1])
-    return CanopyModel(canopy, drawn, tabulate_sections(canopy, drawn, measures, crs=survey.rows.crs))
+    table = tabulate_sections(canopy, drawn, measures, crs=survey.rows.crs)
+    return CanopyModel(canopy, drawn, table, np.zeros(m), np.ones(m, dtype=bool), canopy)
 
 
 def errors(survey, ours):

@@ -16,7 +16,8 @@ CONTRACT = {
     "rows": (
         "row_id label length_m orientation_deg elevation_m elevation_diff_m n_key_points e1_x e1_y e1_z en_x en_y en_z "
         "e1_lat e1_lon e1_alt en_lat en_lon en_alt spacing_m height_m width_m volume_m3 gap_m "
-        "n_missing block support confidence flags bottom_m trv_m3_ha lwa_m2_ha canopy_confidence unseen_m"
+        "n_missing block support confidence flags bottom_m trv_m3_ha lwa_m2_ha canopy_confidence unseen_m "
+        "mesh_error_m"
     ).split(),
     "row_ends": "row_id label end beyond".split(),
     "key_points": "row_id label order position_m".split(),

@@ -183,9 +183,17 @@ def audit(mesh: Mesh) -> Audit:
     )
 
 
-def _breaks(row_id: Ints, position: Values, step: float) -> Flags:
+def breaks(row_id: Ints, position: Values, step: float) -> Flags:
     """Whether the canopy ends (m - 1,) between consecutive sections (m,): another row, or more than one lacks."""
     out: Flags = (np.diff(row_id) != 0) | (np.diff(position) > 2.5 * step)
+    return out
+
+
+def corners_of(canopy: Sections, polygons: Values) -> Floats:
+    """Vertices (m, c, 3) of the sections' polygons (m, c, 2), in the CRS."""
+    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
+    up = np.array([0.0, 0.0, 1.0])
+    out: Floats = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * up
     return out
 
 
@@ -205,10 +213,9 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     step : float
         Metres between sections.
     """
-    normal = np.column_stack([-canopy.tangent[:, 1], canopy.tangent[:, 0], np.zeros(len(canopy.row_id))])
-    corners = canopy.origin[:, None] + polygons[:, :, :1] * normal[:, None] + polygons[:, :, 1:] * np.array([0, 0, 1.0])
-    breaks = _breaks(canopy.row_id, canopy.position, step)
-    runs = [run for run in np.split(np.arange(len(corners)), np.flatnonzero(breaks) + 1) if len(run) > 1]
+    corners = corners_of(canopy, polygons)
+    parted = breaks(canopy.row_id, canopy.position, step)
+    runs = [run for run in np.split(np.arange(len(corners)), np.flatnonzero(parted) + 1) if len(run) > 1]
     caps = _caps(corners[np.array([run[[0, -1]] for run in runs], dtype=np.int64).ravel()])
     pieces: dict[int, list[Any]] = {}
     for run, first, last in zip(runs, caps[::2], caps[1::2], strict=True):

@@ -27,8 +27,13 @@ if TYPE_CHECKING:
     from vinemap.canopy.foliage import Canopy
     from vinemap.canopy.points import Sections
     from vinemap.cloud.tiles import Cloud
+    from vinemap.compute.arrays import Flags, Values
     from vinemap.config.settings import Settings
     from vinemap.geo.raster import Raster
+
+
+SAMPLE = 16
+"""Sections of a row whose points are kept, to hold the model against: more would tell nothing else."""
 
 
 class CanopyModel(NamedTuple):
@@ -40,6 +45,12 @@ class CanopyModel(NamedTuple):
     """c-gons (m, c, 2) in the sections' frames, metres to the left and above the soil."""
     table: gpd.GeoDataFrame
     """The sections in numbers."""
+    reach: Values
+    """Metres (m,) by which the foliage reaches beyond its points."""
+    sampled: Flags
+    """Whether sections (m,) are among the sample, ``SAMPLE`` of a row, at equal steps."""
+    sample: Sections
+    """Those, with the points that their polygons are drawn around."""
 
 
 def find_canopies(
@@ -96,13 +107,18 @@ def model_sections(
     at = join([model.at for model in models])
     polygons = np.concatenate([model.polygons for model in models])
     measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))
-    return CanopyModel(at, polygons, tabulate_sections(at, polygons, measures, crs=crs))
+    reach, sampled = (np.concatenate([getattr(model, name) for model in models]) for name in ("reach", "sampled"))
+    table = tabulate_sections(at, polygons, measures, crs=crs)
+    return CanopyModel(at, polygons, table, reach, sampled, join([model.sample for model in models]))
 
 
 class _RowModel(NamedTuple):
     at: Sections
     polygons: NDArray[np.float64]
     measures: Measures
+    reach: Values
+    sampled: Flags
+    sample: Sections
 
 
 def _model_row(canopy: Canopy, *, c: int, share: float, on_foliage: bool, least: int) -> _RowModel:
@@ -119,4 +135,7 @@ def _model_row(canopy: Canopy, *, c: int, share: float, on_foliage: bool, least:
         sections = sections.subset(np.repeat(valid, np.diff(sections.start)), valid)
     areas = model.shared_area[valid], model.area[valid], model.hull_area[valid]
     measures = measure_sections(sections, grown[valid, 0, 1], areas, c=c)
-    return _RowModel(sections.without_points(), model.polygon[valid], measures)
+    sampled = np.zeros(len(sections.row_id), dtype=bool)
+    sampled[np.linspace(0, len(sampled) - 1, min(len(sampled), SAMPLE)).round().astype(int)] = True
+    sample = sections.subset(np.repeat(sampled, np.diff(sections.start)), sampled)
+    return _RowModel(sections.without_points(), model.polygon[valid], measures, reach[valid], sampled, sample)

@@ -83,6 +83,7 @@ ROWS = KEYS | {
     "support": _real("1", 4, "Share of its length that has canopy, as far as it was seen"),
     "confidence": _real("1", 4, "How sure it is a whole row, 0 to 1"),
     "canopy_confidence": _real("1", 4, "How far to trust height, width and volume, 0 to 1"),
+    "mesh_error_m": _real("m", 3, "How far the foliage's surface lies from the row's mesh, as its points tell"),
     "flags": _text("What is odd beside its neighbours; nothing where nothing is"),
     "e1_lat": _real("deg", 9, "Latitude of end e1, the western one, or a known row's first (WGS 84)"),
     "e1_lon": _real("deg", 9, "Longitude of end e1 (WGS 84)"),

@@ -41,7 +41,7 @@ LAYERS: dict[str, Layer] = {
         | {f"{end}_{axis}": REAL for axes in _END for end in ("e1", "en") for axis in axes}
         | dict.fromkeys(("spacing_m", "height_m", "width_m", "volume_m3", "gap_m"), REAL)
         | {"n_missing": WHOLE, "block": WHOLE, "support": REAL, "confidence": REAL, "flags": TEXT}
-        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha", "canopy_confidence", "unseen_m"), REAL),
+        | dict.fromkeys(("bottom_m", "trv_m3_ha", "lwa_m2_ha", "canopy_confidence", "unseen_m", "mesh_error_m"), REAL),
         "Vine rows: the curve of each row on the ground, with the numbers of Table 2.1",
     ),
     "row_ends": Layer(

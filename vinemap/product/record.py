@@ -10,8 +10,11 @@ import shapely
 
 from vinemap import __version__
 from vinemap.cloud.pdal import pdal_versions
+from vinemap.evaluate.meshes import NUMBERS
 from vinemap.geo.place import doubts_of
+from vinemap.product.json_values import jsonable
 from vinemap.product.notices import height_notices, known_notices, notices, shift_notices, sight_notices
+from vinemap.product.pages.page import mean_of
 from vinemap.surfaces.flights import disagreement
 
 if TYPE_CHECKING:
@@ -110,6 +113,7 @@ def record_of(
         "length_m": round(float(layers["rows"]["length_m"].sum()), 3),
         "unmapped_m2": layers["unmapped"].groupby("reason")["area_m2"].sum().round(1).to_dict(),
         "modelling": modelling.to_dict() if len(sections) else None,
+        "meshes": _meshes(layers["rows"]),
         "shift": _shift(shift, recipe),
         "warnings": _places(recipe, points)
         + [*(recipe.known.remarks if recipe.known else ()), *remarks]
@@ -121,6 +125,18 @@ def record_of(
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
         + [SQUARE] * (square and not recipe.known),
         "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
+    }
+
+
+def _meshes(rows: gpd.GeoDataFrame) -> dict[str, Any]:
+    """How far meshes are off, on the mean by the metre of row and row by row, and how far their points lie from them.
+
+    None stands for what isn't known.
+    """
+    table = rows[["row_id", "label", *NUMBERS]].round(dict.fromkeys(NUMBERS, 4)).astype(object)
+    return {
+        "mesh_error_m": jsonable(round(mean_of(rows["mesh_error_m"], rows["length_m"].to_numpy(dtype=float)), 4)),
+        "rows": jsonable(table.to_dict("records")),
     }
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 
 from vinemap.measure.accuracy.family import measure
-from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, table
+from vinemap.measure.accuracy.figures import CANOPY_COLUMNS, MESH_COLUMNS, table
 from vinemap.measure.accuracy.trust import draw_trust, pool_trust, trust_table
 from vinemap.measure.tables import as_markdown, as_text, fill
 from vinemap.simulate.families import FAMILIES
@@ -39,7 +39,8 @@ def main(families: tuple[str, ...], seeds: int, out: Path | None, markdown: bool
     trusted = pool_trust([trust for *_, trust in results.values()])
     tables = {
         "rows": table({name: rows for name, (rows, *_) in results.items()}),
-        "canopies": table({n: c for n, (_, c, _) in results.items() if len(c.good)}, CANOPY_COLUMNS),
+        "canopies": table({n: c for n, (_, c, *_) in results.items() if len(c.good)}, CANOPY_COLUMNS),
+        "meshes": table({n: m for n, (_, _, m, _) in results.items() if len(m.told)}, MESH_COLUMNS),
         "confidence": trust_table(trusted),
     }
     for lines in tables.values():

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from vinemap.measure.accuracy.canopies import CanopyErrors
+    from vinemap.measure.accuracy.meshes import MeshErrors
     from vinemap.measure.accuracy.rows import Errors
 
 ALONG = ["e1_along_m", "en_along_m"]
@@ -45,7 +46,7 @@ class Measure(NamedTuple):
     """A number of the table, and the bar that it must meet."""
 
     value: Callable[[Any], float]
-    """Of :class:`Errors` or :class:`CanopyErrors`."""
+    """Of :class:`Errors`, :class:`CanopyErrors` or :class:`MeshErrors`."""
     bar: float
     digits: int = 3
     at_least: bool = False
@@ -121,7 +122,22 @@ CANOPY_COLUMNS: Columns = {
 """Numbers of the table of canopies."""
 
 
-def table(results: Mapping[str, Errors | CanopyErrors], columns: Columns = COLUMNS) -> list[list[str]]:
+MESH_COLUMNS: Columns = {
+    "rows": {
+        "all": Measure(lambda e: len(e.told), np.inf, 0),
+        "told": Measure(lambda e: int(np.isfinite(e.told).sum()), np.inf, 0),
+    },
+    "mesh error m": {
+        "told": Measure(lambda e: mean(e.told[np.isfinite(e.told)]), np.inf),
+        "true": Measure(lambda e: mean(e.true[np.isfinite(e.told)]), np.inf),
+        "off": Measure(lambda e: mean((e.told - e.true)[np.isfinite(e.told)]), 0.01),
+        "worst row": Measure(lambda e: quantile(np.abs((e.told - e.true)[np.isfinite(e.told)]), 1), np.inf),
+    },
+}
+"""Numbers of the table of meshes."""
+
+
+def table(results: Mapping[str, Errors | CanopyErrors | MeshErrors], columns: Columns = COLUMNS) -> list[list[str]]:
     """Lines of a table of accuracy, headings first: a line a family, "!" after what misses its bar."""
     lines = [["family", *[f"{heading}: {', '.join(measures)}" for heading, measures in columns.items()]]]
     for name, errors in results.items():

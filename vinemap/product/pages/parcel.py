@@ -48,13 +48,13 @@ TABLE = {
     **dict.fromkeys(("volume_m3", "gap_m", "unseen_m"), 2),
     "n_missing": 0,
     "block": 0,
-    **dict.fromkeys(("support", "confidence", "canopy_confidence"), 3),
+    **dict.fromkeys(("support", "confidence", "canopy_confidence", "mesh_error_m"), 3),
     **dict.fromkeys(("trv_m3_ha", "lwa_m2_ha"), 0),
 }
 """Columns of ``rows`` on the page, and their decimals."""
 UNMAPPED = {"area_m2": 1, "share": 4, "height_m": 1, "width_m": 1}
 """Columns of ``unmapped`` on the page, and their decimals."""
-MEANS = ("height_m", "width_m", "support", "confidence", "canopy_confidence")
+MEANS = ("height_m", "width_m", "support", "confidence", "canopy_confidence", "mesh_error_m")
 """Columns of ``rows`` whose mean the page tells."""
 HISTORY = "history"
 """Where the page holds the numbers of its rows on all dates, once there is more than one."""

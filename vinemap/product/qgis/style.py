@@ -43,6 +43,7 @@ WORDS = {
     "support": "Share of the length with canopy",
     "confidence": "Confidence that it is a row",
     "canopy_confidence": "Confidence in the canopy's numbers",
+    "mesh_error_m": "Distance of the foliage's surface to the mesh (m)",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
     "gap_m": "Length without canopy (m)",
     "unseen_m": "Length that was not seen (m)",

@@ -22,6 +22,7 @@ const COLUMNS = [
   ["support", "Support", "", 2, "Share of the length that was seen with canopy"],
   ["confidence", "Confidence", "", 2, "That it is a whole row, no more and no less: 0 to 1"],
   ["canopy_confidence", "Canopy confidence", "", 2, "In height, width and volume: 0 to 1"],
+  ["mesh_error_m", "Mesh error", "m", 3, "How far the foliage's surface lies from the mesh, by its points: half of it is nearer"],
   ["flags", "Flags", "", null, "What is odd beside the neighbours"],
   ["block", "Block", "", 0, "Rows of one direction and spacing"],
   ["n_key_points", "Key points", "", 0, "Enhanced key points along the row"],

@@ -43,6 +43,7 @@ export function showQuality({ modelling, totals, counts }, rows) {
     ["Over-modelled", percent(modelling?.over), "%", "added around that outline"],
     ["Complexity reduction", number(modelling?.reduction, 3), "", "after Table 3.1"],
     ["Quality score", number(modelling?.quality, 3), "", "1 is best"],
+    ["Mesh error", number(100 * (totals.mesh_error_m ?? NaN), 1), "cm", "mean of the rows’ medians, by their points"],
     ["Points", number((counts?.points ?? NaN) / 1e6, 2), "million", `${plural(counts?.sections ?? 0, "canopy section")}`],
   ]);
 }
