@@ -26,6 +26,7 @@ REMARKS = {
     "product/record.py",
     "product/register/edits.py",
     "product/store.py",
+    "product/write.py",
     "rows/known.py",
     "surfaces/lines.py",
 }

@@ -98,7 +98,7 @@ def make_product(
         record = record_of(recipe, found.cloud, layers, surfaces, **about)
 
         def write() -> list[str]:
-            how = settings.product.model_dump(include={"plain", "geoid"})
+            how = settings.product.model_dump(include={"plain", "geoid", "audit"})
             remarks = write_product(draft, record, layers, rasters, meshes, points, **how)
             if settings.product.classified:
                 cut = found.cloud, found.rows, found.gaps, found.dtm

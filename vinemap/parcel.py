@@ -24,11 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    import geopandas as gpd
     from pyproj import CRS
 
-    from vinemap.canopy.mesh import Mesh
-    from vinemap.canopy.model import CanopyModel
     from vinemap.cloud.pieces import Piece
     from vinemap.cloud.tiles import Cloud
     from vinemap.config.settings import Settings

@@ -178,6 +178,7 @@ class ProductOptions(Options):
 
     classified: bool = Field(default=False, description="the cloud with a class and a row for every point, as LAZ")
     plain: bool = Field(default=False, description="meshes for readers of glTF that know no extension: larger files")
+    audit: bool = Field(default=False, description="meshes checked by Open3D, and a warning for each that has a flaw")
     geoid: float | None = Field(
         None,
         ge=-120,

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap import paths
+from vinemap.canopy.mesh import audit as audit_mesh
 from vinemap.compute.threads import in_threads
+from vinemap.errors import DependencyError
 from vinemap.product.geopackage import write_geopackage
 from vinemap.product.globe import parcel_tileset
-from vinemap.product.gltf import write_glb
+from vinemap.product.gltf import read_glb, write_glb
 from vinemap.product.layers import conform
 from vinemap.product.pages.parcel import write_page
 from vinemap.product.qgis.project import project as qgis_project
@@ -39,11 +41,13 @@ def write_product(
     *,
     plain: bool = False,
     geoid: float | None = None,
+    audit: bool = False,
 ) -> list[str]:
     """Write the files of a product but ``run.json``, of which the ``record`` is all else, and its rasters.
 
     ``plain`` meshes need no extension of glTF. The ``geoid`` is added to heights on the globe, m
-    (:func:`vinemap.geo.geoid.find_geoid`). What is to be known of what was written is returned: a sentence each.
+    (:func:`vinemap.geo.geoid.find_geoid`). An ``audit`` of the meshes, as they were written, goes to the record's
+    warnings. What is to be known of what was written is returned: a sentence each.
 
     Raises
     ------
@@ -55,6 +59,8 @@ def write_product(
 
     def canopies_and_page() -> list[str]:
         _write_meshes(folder, parcel, meshes, points, plain=plain, geoid=geoid)
+        flaws = audit_meshes(paths.canopy_mesh(folder, parcel)) if audit else []
+        record["warnings"] += flaws  # before the page that tells them
         return write_page(folder, record, layers, rasters["dtm"], rasters["chm"])
 
     writers: list[Callable[[], list[str] | None]] = [
@@ -63,6 +69,23 @@ def write_product(
         partial(_write_project, folder, parcel, tables, rasters, date=date, vertical=points.vertical),
     ]
     return [remark for told in in_threads(lambda write: write(), writers) for remark in told or ()]
+
+
+def audit_meshes(path: Path) -> list[str]:
+    """What Open3D finds wrong with the meshes of a product's glTF, a sentence a row, or that it can't be asked."""
+    found = []
+    for mesh in read_glb(path).meshes:
+        if len(mesh.faces) == 0:
+            continue
+        try:
+            said = audit_mesh(mesh)
+        except DependencyError as error:
+            return [f"the meshes were not audited: {error}"]
+        flaws = {"isn't closed": not said.edge_manifold, "intersects itself": said.self_intersecting}
+        told = [flaw for flaw, holds in flaws.items() if holds]
+        if told or not said.watertight:
+            found.append(f"the mesh of row {mesh.label} {' and '.join(told) or 'meets itself at a vertex'}")
+    return found
 
 
 def _write_meshes(
