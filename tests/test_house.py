@@ -27,6 +27,7 @@ ROOMS = [
     "product",
     "odometry",
     "export",
+    "view",
     "stages",
     "chain",
     "making",

@@ -38,5 +38,5 @@ def test_without_open3d_it_is_said_once(monkeypatch, tmp_path):
 
     monkeypatch.setattr(extras, "import_module", fails)
     (said,) = audit_meshes(written(rows(), tmp_path / "a.glb"))
-    assert said.startswith("the meshes were not audited: the check of meshes needs Open3D, which can't be loaded")
+    assert said.startswith("the meshes were not audited: looking at meshes needs Open3D, which can't be loaded")
     assert audit_meshes(written([], tmp_path / "none.glb")) == []

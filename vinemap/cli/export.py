@@ -1,4 +1,4 @@
-"""``vinemap export``: write rows, lanes, canopies and tables for tractors, robots and other programs."""
+"""``vinemap export``: rows, lanes, canopies and tables for other programs; ``vinemap view``: products in Open3D."""
 
 from __future__ import annotations
 
@@ -40,3 +40,25 @@ def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | Non
     chosen = FORMATS if "all" in formats else tuple(dict.fromkeys(formats))
     for line in export_products(products, out or paths.exports(), formats=chosen, **options):
         click.echo(line)
+
+
+@click.command()
+@click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
+@click.option("--cloud", type=FILE, help="Points to show; by default the product's classified cloud, if it has one.")
+@click.option("--png", type=FILE, help="Picture to write instead of opening a window; needed where there is no screen.")
+def view(products: tuple[Path, ...], cloud: Path | None, png: Path | None) -> None:
+    """Show cloud, rows and meshes of each PRODUCT (its folder or GeoPackage, or that of a survey)."""
+    from vinemap.compute.extras import load
+    from vinemap.errors import InputError
+    from vinemap.view.scene import scene_of
+    from vinemap.view.window import has_screen, show
+
+    load("open3d")
+    if png is None and not has_screen():
+        raise InputError("There is no screen here: give --png FILE for a picture")
+    scene = scene_of(products, cloud)
+    if not len(scene.points):
+        click.echo("Rows and meshes without points: give --cloud FILE, or map with product: {classified: true}")
+    show(scene, png)
+    if png:
+        click.echo(f"→ {png}")

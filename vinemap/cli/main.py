@@ -12,7 +12,7 @@ from vinemap.cli.config import config
 from vinemap.cli.doctor import doctor
 from vinemap.cli.estate import example, nightly, parcel
 from vinemap.cli.evaluate import evaluate
-from vinemap.cli.export import export
+from vinemap.cli.export import export, view
 from vinemap.cli.register import register
 from vinemap.cli.run import run
 from vinemap.cli.setup import qgis_plugin, warm
@@ -27,7 +27,7 @@ def commands() -> None:
     """Vine rows and light canopy meshes from UAV point clouds."""
 
 
-for command in (run, survey, parcel, nightly, register, config, evaluate, export, track, example):
+for command in (run, survey, parcel, nightly, register, config, evaluate, export, view, track, example):
     commands.add_command(command)
 for command in (warm, doctor, qgis_plugin):
     commands.add_command(command)

@@ -21,7 +21,7 @@ class Extra(NamedTuple):
 
 EXTRAS = {
     "prefect": Extra("nightly", "Prefect", "a schedule"),
-    "open3d": Extra("mesh", "Open3D", "the check of meshes", ", and apt-get install libegl1 libgl1 libusb-1.0-0"),
+    "open3d": Extra("mesh", "Open3D", "looking at meshes", ", and apt-get install libegl1 libgl1 libusb-1.0-0"),
     "cv2": Extra("track", "OpenCV", "visual odometry"),
     "distributed": Extra("dask", "Dask", "a cluster"),
     "pye57": Extra("e57", "pye57", "reading E57"),
