@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 ROOMS = [
@@ -296,6 +297,15 @@ def test_constraints_cover_what_the_project_needs():
     ]
     pinned = {key(line.split("==")[0]) for line in constraints()} | {"vinemap"}
     assert {key(re.match(r"[\w.-]+", need)[0]) for need in needed} - pinned == set()
+
+
+def test_condas_environment_is_what_the_project_needs():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    given = yaml.safe_load((ROOT / "environment.yml").read_text(encoding="utf-8"))["dependencies"]
+    given = [*(one for one in given if isinstance(one, str)), *given[-1]["pip"]]
+    wanted = {need.replace("[lazrs]", "") for need in project["dependencies"]}
+    assert wanted - set(given) == set()
+    assert {"lazrs-python", "python-pdal>=3.4", "--editable ."} <= set(given)
 
 
 def test_constraints_hold_the_set_with_which_prefect_runs():

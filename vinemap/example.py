@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from vinemap import paths
-from vinemap.cloud.pdal import check_engine
+from vinemap.cloud.pdal.engine import check_engines
 from vinemap.config.surveys import SurveyConfig, choose_parcel, load_survey
 from vinemap.errors import InputError, OutputError
 from vinemap.simulate.scenes import barolo
@@ -47,7 +47,7 @@ def ready(path: Path, parcel: str) -> tuple[SurveyConfig, str]:
     """
     config = load_survey(path)
     parcel = choose_parcel(config, parcel)
-    check_engine(config.settings.ground.engine)
+    check_engines([config.of_parcel(parcel).settings])
     ensure_cloud(config)
     return config, parcel
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinemap import paths
 from vinemap.cloud.las import read_cloud
-from vinemap.cloud.pdal import check_engine, read_cloud_pdal
+from vinemap.cloud.pdal.engine import check_engines
+from vinemap.cloud.pdal.ground import classified
 from vinemap.cloud.pieces import read_piece
 from vinemap.cloud.tiles import Collector
 from vinemap.compute import machine
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-BYTES_A_POINT = 60
-"""Memory that a run takes: half of the machine's is for it."""
+BYTES_A_POINT = {"vinemap": 60, "pdal": 200}
+"""Memory that a run takes, by its engine: half of the machine's is for it."""
 
 
 def map_parcel(
@@ -87,7 +88,7 @@ def map_parcel(
     """
     name = check_parcel(parcel)
     if settings:
-        check_engine(settings.ground.engine)
+        check_engines([settings])
     given: dict[str, Any] = {"boundary": boundary, "crs": crs, "origin": origin}
     given |= {"rows": rows, "rows_crs": rows_crs, "vines": vines}
     recipe = recipe_of(cloud, parcel=name, named=named, settings=settings, **given)
@@ -119,7 +120,7 @@ def follow(
         As for :func:`map_parcel`; the same errors are raised.
     """
     settings, origin = recipe.settings, recipe.origin
-    check_engine(settings.ground.engine)
+    check_engines([settings])
     began = time.perf_counter()
     seconds: dict[str, float] = {}
 
@@ -130,7 +131,7 @@ def follow(
         return out
 
     with store.product(folder, drafts=drafts, within=within) as draft:
-        points = _read(recipe, piece, draft, run)
+        points: Cloud = run("Reading", _read, recipe, piece, draft)
         if origin:
             check_near(origin, points.extent[0], points.crs)
         from vinemap.making import make_product  # half a second of start-up, for what could be read
@@ -148,22 +149,22 @@ def follow(
     return Summary(recipe.parcel, folder, record["counts"]["rows"], length, took, tuple(record["warnings"]))
 
 
-def _read(recipe: Recipe, piece: Piece | None, draft: Path, run: Callable[..., Any]) -> Cloud:
-    """The points that a recipe asks for, in memory or in tiles beside the draft."""
+def _read(recipe: Recipe, piece: Piece | None, draft: Path) -> Cloud:
+    """The points that a recipe asks for, in memory or in tiles beside the draft, as its engine gives them."""
     settings, collector = recipe.settings, _collector(recipe.settings, paths.tiles(draft))
+    engine = settings.ground.engine
     if piece:
-        points: Cloud = run("Reading", read_piece, piece, collector)
-        return points
-    how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary}
-    if settings.ground.engine == "pdal":
-        points = run("Reading", read_cloud_pdal, recipe.clouds, **how)
+        cloud = read_piece(piece, collector)
     else:
-        points = run("Reading", read_cloud, recipe.clouds, collector=collector, **how)
-    recipe.check()
-    return points
+        how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary, "engine": engine}
+        cloud = read_cloud(recipe.clouds, collector=collector, **how)
+        recipe.check()
+    if engine == "vinemap":
+        return cloud
+    return classified(cloud, settings.ground, _collector(settings, paths.tiles(draft) / "classified"))
 
 
 def _collector(settings: Settings, folder: Path) -> Collector:
     """What takes points, in tiles in a folder beyond what memory is for."""
-    most = settings.reading.max_points or machine.memory() // 2 // BYTES_A_POINT
+    most = settings.reading.max_points or machine.memory() // 2 // BYTES_A_POINT[settings.ground.engine]
     return Collector(folder, most=most, block=block_side(settings.ground.resolution))

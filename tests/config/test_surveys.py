@@ -83,6 +83,7 @@ def test_defaults_of_settings_are_those_of_the_stages():
     from vinemap.rows.known import follow_lines
     from vinemap.surfaces.cover import canopy_cover
     from vinemap.surfaces.ground import terrain_model
+    from vinemap.surfaces.map import PDALS
 
     stages = {
         "ground": [terrain_model],
@@ -102,7 +103,8 @@ def test_defaults_of_settings_are_those_of_the_stages():
         if name in stages:
             parameters = [p for function in stages[name] for p in inspect.signature(function).parameters.values()]
             defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
-            options.pop("align", None)  # the chain's own
+            for own in ("align", *PDALS):  # the chain's
+                options.pop(own, None)
             assert defaults == options | {k: others[k] for k in defaults if k not in options}
 
 

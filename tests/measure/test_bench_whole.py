@@ -1,5 +1,6 @@
 """The whole job by other tools: its steps on rows made by hand."""
 
+import json
 from importlib.util import find_spec
 from types import SimpleNamespace
 
@@ -65,18 +66,16 @@ def test_pdal_goes_before_the_cloth(monkeypatch):
     points = np.array([(1.0, 2.0, 3.5, 0.5)], dtype=[(name, float) for name in ("X", "Y", "Z", "HeightAboveGround")])
 
     class Pipeline:
-        arrays = ()
+        arrays = (points, points)
 
-        def __or__(self, stage):
-            assert stage == "nearest ground"
-            return self
+        def __init__(self, stages, arrays):
+            assert [stage["type"] for stage in json.loads(stages)] == ["filters.smrf", "filters.hag_nn"]
+            assert arrays[0].dtype.names == ("X", "Y", "Z")
 
         def execute(self):
-            self.arrays = [points, points]
+            pass
 
-    pdal = SimpleNamespace(Filter=SimpleNamespace(hag_nn=lambda: "nearest ground"))
-    monkeypatch.setattr(whole, "load_pdal", lambda: pdal)
-    monkeypatch.setattr(whole, "ground_pipeline", lambda _: Pipeline())
+    monkeypatch.setattr(whole, "load_pdal", lambda: SimpleNamespace(Pipeline=Pipeline))
     monkeypatch.setattr(whole, "pdal_versions", lambda: {"libpdal": "2.9"})
     xyz, heights, by = above_ground(np.zeros((2, 3)))
     assert xyz.tolist() == [[1.0, 2.0, 3.5]] * 2

@@ -83,7 +83,7 @@ def _needed() -> tuple[list[tuple[str, str]], bool]:
 def _extras() -> Iterator[tuple[str, str]]:
     from importlib.metadata import packages_distributions, version
 
-    from vinemap.cloud.pdal import pdal_versions
+    from vinemap.cloud.pdal.engine import pdal_versions
     from vinemap.compute.extras import EXTRAS, load
     from vinemap.errors import DependencyError
 

@@ -12,6 +12,7 @@ import shapely
 
 from vinemap.cloud.copc import is_copc, points_about
 from vinemap.cloud.files import listed, worded
+from vinemap.cloud.formats.box import MOST_OUTSIDE, STRAYS, n_outside, stated_box
 from vinemap.cloud.formats.chunks import other_chunks
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.formats.told import needed
@@ -51,10 +52,6 @@ FARTHEST, FINEST = 1e9, 1e-15
 """Metres, feet or degrees beyond which no place lies, and below which no step is stored."""
 WHOLE = 0.01
 """Steps of the scale by which the box that a header states may miss whole numbers of them."""
-LOOSE = 0.003
-"""Share of its widest side by which points may lie outside of the box that the header states."""
-MOST_OUTSIDE, STRAYS = 0.0001, 3
-"""Share of the points that may lie farther outside, and a number of them that always may."""
 
 DISK = "Failed to use read"
 """What lazrs says of any fault in reading bytes."""
@@ -70,6 +67,7 @@ def read_cloud(
     crs: CRS | None = None,
     boundary: Boundary | None = None,
     collector: Collector | None = None,
+    engine: str = "vinemap",
 ) -> Cloud:
     """Read LAS, LAZ or COPC files in chunks into one metric projected CRS, clipped to a polygon.
 
@@ -86,6 +84,8 @@ def read_cloud(
         Polygon to clip to.
     collector : Collector, optional
         Takes the points; by default in memory.
+    engine : str
+        What reads the files: "vinemap", or "pdal".
 
     Raises
     ------
@@ -93,7 +93,7 @@ def read_cloud(
         If a file can't be read whole, has no points, no CRS, or coordinates that can't be right.
     """
     points, files = collector or Collector(), listed(clouds)
-    with open_cloud(files, crs=crs, around=boundary) as (place, chunks):
+    with open_cloud(files, crs=crs, around=boundary, engine=engine) as (place, chunks):
         zones = zones_of([boundary_in(boundary, place.crs, files[0])]) if boundary else None
         for xyz in chunks:
             points.add(deal(xyz, zones)[0] if zones else xyz)
@@ -116,7 +116,11 @@ def collected(points: Collector, place: Place, files: Sequence[Path]) -> Cloud:
 
 @contextmanager
 def open_cloud(
-    clouds: Path | Sequence[Path], *, crs: CRS | None = None, around: Boundary | None = None
+    clouds: Path | Sequence[Path],
+    *,
+    crs: CRS | None = None,
+    around: Boundary | None = None,
+    engine: str = "vinemap",
 ) -> Iterator[tuple[Place, Iterator[Floats]]]:
     """Open LAS, LAZ or COPC files: gives the place of the first in a metric CRS, and chunks of points (n, 3) of all.
 
@@ -124,7 +128,7 @@ def open_cloud(
     :func:`read_cloud`.
     """
     files, remarks = listed(clouds), list[str]()
-    with closing(_chunks_of(files, crs, around, remarks)) as chunks:
+    with closing(_chunks_of(files, crs, around, remarks, engine)) as chunks:
         first = next(chunks, None)
         if first is None:
             raise _none_inside(files)
@@ -147,12 +151,12 @@ class _Chunk(NamedTuple):
 
 
 def _chunks_of(
-    files: Sequence[Path], crs: CRS | None, around: Boundary | None, remarks: list[str]
+    files: Sequence[Path], crs: CRS | None, around: Boundary | None, remarks: list[str], engine: str
 ) -> Generator[_Chunk]:
     """Usable points of files, one after the other, once their first ones were found to be where they can be."""
     for path in files:
-        if kind_of(path):
-            for xyz, source in other_chunks(path, crs, around, remarks):
+        if kind_of(path) or engine == "pdal":
+            for xyz, source in other_chunks(path, crs, around, remarks, engine=engine):
                 yield _Chunk(xyz, source, path)
             continue
         with opened(path, crs=crs) as (reader, source, layout):
@@ -230,13 +234,13 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
     total, done = reader.header.point_count if found is None else len(found), 0
     beyond, blank = 0, 0
     size = max(1, min(CHUNK, MOST_BYTES // reader.header.point_format.size))
-    box = _stated_box(reader.header)
+    box = stated_box(reader.header)
     try:
         for chunk in reader.chunk_iterator(size) if found is None else [found]:
             done += len(chunk)
             blank += _n_blank(chunk)
             columns = [np.asarray(column) for column in (chunk.x, chunk.y, chunk.z)]
-            beyond += _n_outside(columns, box)
+            beyond += n_outside(columns, box)
             xyz = _usable(np.column_stack(columns), chunk)
             if len(xyz):
                 yield xyz
@@ -262,23 +266,6 @@ def _n_blank(chunk: Any) -> int:
     return int(((data == 0) | (data == 255)).all(axis=1).sum())
 
 
-def _stated_box(header: Any) -> Box | None:
-    """Corners (3,) between which a header says that the points lie, with some room; None if it says nothing."""
-    low, high = header.mins, header.maxs
-    if not (np.isfinite([low, high]).all() and (high > low)[:2].all()):
-        return None
-    room = LOOSE * (high - low).max()
-    return low - room, high + room
-
-
-def _n_outside(columns: Sequence[Floats], box: Box | None) -> int:
-    """How many points, of which there are three columns (n,) of coordinates, lie outside of a box."""
-    within = list(zip(columns, *box, strict=True)) if box and len(columns[0]) else []
-    if all(low <= column.min() and column.max() <= high for column, low, high in within):
-        return 0
-    return int(np.any([(column < low) | (column > high) for column, low, high in within], axis=0).sum())
-
-
 def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
     """Corners (3,) about a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
     if not is_copc(header):
@@ -301,7 +288,7 @@ def _none_inside(files: Sequence[Path]) -> OutsideError:
 
 
 def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
-    """What is said of a file that laspy, lazrs or PDAL can't read, or its disk can't now."""
+    """What is said of a file that laspy and lazrs can't read, or its disk can't now."""
     reason = str(error).strip().split("\n")[0] or type(error).__name__
     if DISK in reason or (isinstance(error, OSError) and error.errno in PASSING):
         return BusyError(f"{path}: can't be read now ({reason}): try again")

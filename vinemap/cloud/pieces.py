@@ -37,7 +37,12 @@ class Piece(NamedTuple):
 
 
 def split_cloud(
-    clouds: Path | Sequence[Path], boundaries: Sequence[Boundary], folder: Path, *, crs: CRS | None = None
+    clouds: Path | Sequence[Path],
+    boundaries: Sequence[Boundary],
+    folder: Path,
+    *,
+    crs: CRS | None = None,
+    engine: str = "vinemap",
 ) -> list[Piece | InputError]:
     """Read LAS, LAZ or COPC files once, and give every polygon its points; in several polygons' they go to each.
 
@@ -51,6 +56,8 @@ def split_cloud(
         Where the files go, 24 bytes a point.
     crs : CRS, optional
         CRS of the files' coordinates, where they state none or a wrong one.
+    engine : str
+        What reads the files, as of :func:`vinemap.cloud.las.read_cloud`.
 
     Returns
     -------
@@ -65,10 +72,8 @@ def split_cloud(
         If the folder is full.
     """
     files = listed(clouds)
-    with open_cloud(files, crs=crs, around=_all_of(boundaries) if any(map(naming.url_of, files)) else None) as (
-        place,
-        chunks,
-    ):
+    around = _all_of(boundaries) if any(map(naming.url_of, files)) else None
+    with open_cloud(files, crs=crs, around=around, engine=engine) as (place, chunks):
         pieces: list[Piece | InputError] = []
         polygons, drafts = [], []
         for number, boundary in enumerate(boundaries):

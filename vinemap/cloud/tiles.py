@@ -16,6 +16,7 @@ from vinemap.geo.raster import extent, squares
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from numpy.typing import NDArray
     from pyproj import CRS
 
     from vinemap.compute.arrays import Floats, Values
@@ -30,13 +31,21 @@ FARTHEST = 1e9
 
 
 class Tile(NamedTuple):
-    """A file of points (n, 3) as float64, their extent, and the index of the first in the cloud."""
+    """A file of points (n, 3) as float64, their extent, and the index of the first in the cloud.
+
+    Points that have classes are (n, 4).
+    """
 
     path: Path
     low: Floats
     high: Floats
     size: int
     first: int = 0
+    columns: int = 3
+
+    def points(self) -> Floats:
+        """What the file holds."""
+        return np.fromfile(self.path).reshape(-1, self.columns)
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,8 @@ class TiledCloud:
         for tile in self.tiles:
             box = shapely.box(*tile.low[:2], *tile.high[:2])
             if near is None or shapely.dwithin(box, near, reach):
-                part = PointCloud(np.fromfile(tile.path).reshape(-1, 3), self.crs, self.vertical, first=tile.first)
+                xyz, classes = _parted(tile.points())
+                part = PointCloud(xyz, self.crs, self.vertical, first=tile.first, classification=classes)
                 yield part.above(self.dtm, self.ceiling) if self.dtm else part
 
     def above(self, dtm: Raster, ceiling: Raster | None = None) -> TiledCloud:
@@ -88,14 +98,16 @@ class Collector:
         self.folder, self.most, self.block = folder, most, block
         self.xyz = np.empty((0, 3))
         self.tiles: dict[Path, Tile] = {}
-        self.size = 0
+        self.size, self.columns = 0, 3
 
     def add(self, xyz: Floats) -> None:
-        """Take points (n, 3)."""
+        """Take points (n, 3), or (n, 4) with their classes: the first ones tell which all are."""
+        if self.size == 0:
+            self.columns = xyz.shape[1]
         before, self.size = self.size, self.size + len(xyz)
         if self.size <= self.most:
             # Grown in place: a list of chunks joined at the end would take twice the memory.
-            self.xyz.resize((self.size, 3), refcheck=False)
+            self.xyz.resize((self.size, self.columns), refcheck=False)
             self.xyz[before:] = xyz
             return
         for k in range(0, len(self.xyz), CHUNK):
@@ -106,10 +118,12 @@ class Collector:
     def cloud(self, crs: CRS, vertical: str | None, least: Floats, most: Floats) -> Cloud:
         """What was taken and lies between two corners (3,)."""
         if not self.tiles:
-            low, high = extent(self.xyz)
+            xyz, classes = _parted(self.xyz)
+            low, high = extent(xyz)
             if (low < least).any() or (high > most).any():
-                self.xyz = self.xyz[((self.xyz >= least) & (self.xyz <= most)).all(axis=1)]
-            return PointCloud(self.xyz, crs, vertical)
+                self.xyz = self.xyz[((xyz >= least) & (xyz <= most)).all(axis=1)]
+                xyz, classes = _parted(self.xyz)
+            return PointCloud(xyz, crs, vertical, classification=classes)
         tiles, first = [], 0
         for tile in sorted(self.tiles.values()):
             kept = _between(tile, least, most)
@@ -122,10 +136,10 @@ class Collector:
         """About n of the points, evenly."""
         step = max(1, self.size // n)
         if not self.tiles:
-            return self.xyz[::step]
+            return self.xyz[::step, :3]
         parts, passed = [], 0
-        for path, tile in self.tiles.items():
-            parts.append(np.fromfile(path).reshape(-1, 3)[-passed % step :: step])
+        for tile in self.tiles.values():
+            parts.append(tile.points()[-passed % step :: step, :3])
             passed += tile.size
         return np.concatenate(parts)
 
@@ -144,9 +158,10 @@ class Collector:
             path = paths.tile(self.folder, int(column[member[0]]), int(row[member[0]]))
             with path.open("ab") as stream:
                 stream.write(points.data)
-            low, high = extent(points)
-            old = self.tiles.get(path, Tile(path, low, high, 0))
-            self.tiles[path] = Tile(path, np.minimum(low, old.low), np.maximum(high, old.high), old.size + len(points))
+            low, high = extent(_parted(points)[0])
+            old = self.tiles.get(path, Tile(path, low, high, 0, columns=self.columns))
+            low, high = np.minimum(low, old.low), np.maximum(high, old.high)
+            self.tiles[path] = old._replace(low=low, high=high, size=old.size + len(points))
 
 
 def moved(cloud: Cloud, by: Values, collector: Collector) -> Cloud:
@@ -158,7 +173,8 @@ def moved(cloud: Cloud, by: Values, collector: Collector) -> Cloud:
     if isinstance(cloud, PointCloud):
         return replace(cloud, xyz=cloud.xyz + way, _kept={})
     for part in cloud.parts():
-        collector.add(part.xyz + way)
+        there = part.xyz + way
+        collector.add(there if part.classification is None else np.column_stack([there, part.classification]))
     everywhere = np.full(3, np.inf)
     return replace(collector.cloud(cloud.crs, cloud.vertical, -everywhere, everywhere), remarks=cloud.remarks)
 
@@ -167,7 +183,16 @@ def _between(tile: Tile, least: Floats, most: Floats) -> Tile:
     """A tile, on disk too, with no points but those between two corners (3,)."""
     if (tile.low >= least).all() and (tile.high <= most).all():
         return tile
-    xyz = np.fromfile(tile.path).reshape(-1, 3)
-    xyz = xyz[((xyz >= least) & (xyz <= most)).all(axis=1)]
-    xyz.tofile(tile.path)
-    return Tile(tile.path, *extent(xyz), len(xyz))
+    points = tile.points()
+    xyz = points[:, :3]
+    points = points[((xyz >= least) & (xyz <= most)).all(axis=1)]
+    points.tofile(tile.path)
+    low, high = extent(_parted(points)[0])
+    return tile._replace(low=low, high=high, size=len(points))
+
+
+def _parted(points: Floats) -> tuple[Floats, NDArray[np.uint8] | None]:
+    """Coordinates (n, 3) of points, and their classes, if they have some."""
+    if points.shape[1] == 3:
+        return points, None
+    return np.ascontiguousarray(points[:, :3]), points[:, 3].astype(np.uint8)

@@ -1,7 +1,8 @@
-"""Processes that are measured: how long they take, and what memory they and theirs hold."""
+"""Processes: how long they take, what memory they and theirs hold, and that they end with the one that started them."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 """Signals by which this system asks a process to end, beside Ctrl-C."""
+PR_SET_PDEATHSIG = 1
+"""Of Linux's prctl(2)."""
 
 
 class Outcome(NamedTuple):
@@ -125,3 +128,13 @@ def high_water(*, status: Path = Path("/proc/self/status"), reset: Path = Path("
     except (OSError, StopIteration):
         return None
     return int(kilobytes) * 1024
+
+
+def die_with_parent() -> None:
+    """Have the system end this process with its parent (on Linux), even in the midst of a library's call."""
+    parent = os.getppid()
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -24,14 +25,57 @@ class ReadingOptions(Options):
     )
 
 
+class SmrfOptions(Options):
+    """PDAL's simple morphological filter (Pingel et al. 2013)."""
+
+    cell: Metres = Field(0.5, description="raster of lowest points, finer than an inter-row (m); PDAL's: 1")
+    slope: float = Field(0.7, gt=0, le=10, description="rise over run above which an edge isn't terrain; PDAL's: 0.15")
+    window: Metres = Field(8.0, description="half the width of trees and houses (m); PDAL's: 18")
+    scalar: float = Field(0.35, ge=0, le=10, description="threshold more, for each unit of slope (m); PDAL's: 1.25")
+    threshold: Metres = Field(0.15, description="distance from the lowest surface of ground (m); PDAL's: 0.5")
+
+
+class CsfOptions(Options):
+    """PDAL's cloth simulation filter (Zhang et al. 2016)."""
+
+    resolution: Metres = Field(0.5, description="meshes of the cloth (m); PDAL's: 1")
+    threshold: Metres = Field(0.15, description="distance from the cloth of ground (m); PDAL's: 0.5")
+    rigidness: int = Field(1, ge=1, le=3, description="stiffness of the cloth: 1 on slopes, 3 on plains; PDAL's: 3")
+    iterations: int = Field(500, ge=1, le=100_000, description="steps of time at the most; PDAL's: 500")
+    step: float = Field(0.65, gt=0, le=10, description="length of a step of time; PDAL's: 0.65")
+    smooth: bool = Field(default=True, description="whether steep slopes are seen to afterwards; PDAL's: true")
+
+
+class PmfOptions(Options):
+    """PDAL's progressive morphological filter (Zhang et al. 2003)."""
+
+    cell_size: Metres = Field(0.5, description="raster of lowest points, finer than an inter-row (m); PDAL's: 1")
+    slope: float = Field(0.7, gt=0, le=10, description="rise over run up to which all is terrain; PDAL's: 1")
+    initial_distance: Metres = Field(0.15, description="distance from the lowest surface of ground (m); PDAL's: 0.15")
+    max_distance: Metres = Field(0.5, description="the same, at the most (m); PDAL's: 2.5")
+    max_window_size: Metres = Field(16.0, description="width of trees and houses (m); PDAL's: 33")
+    exponential: bool = Field(default=True, description="whether windows double, or grow evenly; PDAL's: true")
+
+
 class GroundOptions(Options):
     """Terrain model."""
 
-    engine: Literal["vinemap", "pdal"] = Field("vinemap", description="ours, or PDAL's readers and its SMRF")
+    engine: Literal["vinemap", "pdal"] = Field("vinemap", description="ours, or PDAL's readers and its filters")
+    filter: Literal["smrf", "csf", "pmf"] = Field("smrf", description="filter of PDAL's that finds ground")
+    smrf: SmrfOptions = SmrfOptions()
+    csf: CsfOptions = CsfOptions()
+    pmf: PmfOptions = PmfOptions()
+    pipeline: Path | None = Field(None, description="file with PDAL's filters, in JSON; none: the one above")
     resolution: float = Field(0.25, ge=0.05, le=2, description="cell size of the DTM (m)")
     quantile: float = Field(0.1, gt=0, le=0.5, description="order of the height that stands for a cell's terrain")
     tolerance: Metres = Field(0.12, description="height above the surface around it at which a cell is terrain (m)")
     terrace_height: float = Field(1.0, ge=0, le=5, description="height up to which a thin layer is a terrace (m)")
+
+    @model_validator(mode="after")
+    def _fitting(self) -> GroundOptions:
+        if self.pipeline and self.engine != "pdal":
+            raise ValueError("a pipeline of PDAL's wants engine: pdal")
+        return self
 
 
 class CoverOptions(Options):

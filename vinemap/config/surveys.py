@@ -86,6 +86,10 @@ class _Surveys(Options):
                 raise ValueError(f"overrides has {name!r}, which isn't among parcels: {nearest(name, self.parcels)}")
         return self
 
+    def all_settings(self) -> list[Settings]:
+        """Settings for all parcels, and those for single ones."""
+        return [self.settings, *(own.settings for own in self.overrides.values())]
+
     def of_parcel(self, name: str) -> ParcelConfig:
         """What holds for a parcel."""
         return self.overrides.get(name) or ParcelConfig(origin=self.origin, settings=self.settings)

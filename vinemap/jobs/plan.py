@@ -106,6 +106,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     ------
     InputError
         If the cloud, the boundaries or the rows can't be read.
+    DependencyError
+        If an engine can't be loaded.
     """
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)

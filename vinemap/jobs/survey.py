@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from vinemap import paths
 from vinemap.cloud.files import worded
+from vinemap.cloud.pdal.engine import check_engines
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
@@ -89,6 +90,7 @@ def map_survey(
         If the cloud or the boundaries can't be read at all, or nothing can be written.
     """
     began = datetime.now(UTC)
+    check_engines(config.all_settings())
     with workshop(folder) as aside:
         plan = plan_survey(config, folder, again=again)
         outcomes: list[Outcome] = []
@@ -192,25 +194,37 @@ def _work(
 
 def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recipe, Piece | Outcome | None]]:
     """Recipes with their points, the largest first; with none where a parcel reads them itself, of a COPC's, say."""
-    together = [r for r in plan.recipes if _is_dealt(r)] if sum(map(_is_dealt, plan.recipes)) > 1 else []
+    dealt: dict[str, list[Recipe]] = {}
     for recipe in plan.recipes:
-        if not together or not _is_dealt(recipe):
+        if recipe.boundary is not None:
+            dealt.setdefault(recipe.settings.ground.engine, []).append(recipe)
+    together = [recipes for recipes in dealt.values() if len(recipes) > 1]
+    for recipe in plan.recipes:
+        if not any(recipe in recipes for recipes in together):
             yield recipe, None
-    if not together:
-        return
-    clouds, limit = together[0].clouds, config.job.limit * len(together)
+    for number, recipes in enumerate(together):
+        folder = aside / str(number)
+        folder.mkdir()
+        yield from _dealt(recipes, plan, config, folder)
+
+
+def _dealt(
+    recipes: list[Recipe], plan: Plan, config: SurveyConfig, aside: Path
+) -> Iterator[tuple[Recipe, Piece | Outcome]]:
+    """Recipes of one engine, which reads their cloud once, with their points."""
+    clouds, limit = recipes[0].clouds, config.job.limit * len(recipes)
     reader = Worker(cores=machine.cores(), memory=_memory(config.job, 1))
+    how = {"crs": recipes[0].crs, "engine": recipes[0].settings.ground.engine}
     try:
-        boundaries = [recipe.boundary for recipe in together]
-        pieces = reader.run(_split, clouds, boundaries, aside, crs=together[0].crs, limit=limit)
+        pieces = reader.run(_split, clouds, [recipe.boundary for recipe in recipes], aside, **how, limit=limit)
     except WorkerError as error:
         raise WorkerError(f"{worded(clouds)}: can't be read: {error}") from error
     finally:
         reader.close()
-    together[0].check()
+    recipes[0].check()
     sizes = [0 if isinstance(piece, InputError) else piece.path.stat().st_size for piece in pieces]
     for k in sorted(range(len(pieces)), key=lambda k: -sizes[k]):
-        recipe, piece = together[k], pieces[k]
+        recipe, piece = recipes[k], pieces[k]
         if isinstance(piece, InputError):
             yield recipe, Outcome(recipe.parcel, FAILED, reason=str(piece), key=recipe.key)
         elif sizes[k] == 0 and not plan.listed:
@@ -219,16 +233,11 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
             yield recipe, piece
 
 
-def _is_dealt(recipe: Recipe) -> bool:
-    """Whether a parcel can have its points from where the cloud is read once for all."""
-    return recipe.boundary is not None and recipe.settings.ground.engine != "pdal"
-
-
 def _split(
-    clouds: Sequence[Path], boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None
+    clouds: Sequence[Path], boundaries: Sequence[Boundary], aside: Path, *, crs: CRS | None, engine: str
 ) -> list[Piece | InputError]:
     try:
-        return split_cloud(clouds, boundaries, aside, crs=crs)
+        return split_cloud(clouds, boundaries, aside, crs=crs, engine=engine)
     except OSError as error:
         raise unwritable(aside.parent, error) from error
 

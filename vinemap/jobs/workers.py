@@ -8,7 +8,6 @@ notebooks, scripts without a main guard and Dask's daemonic workers can start so
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import pickle
 import queue
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from vinemap.compute import machine
+from vinemap.compute.processes import die_with_parent
 from vinemap.errors import VinemapError, WorkerError, own_fault
 
 if TYPE_CHECKING:
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-PR_SET_PDEATHSIG = 1
-"""Of Linux's prctl(2)."""
 LENGTH = struct.Struct("<Q")
 """Of the number of bytes that stands before a message."""
 SERVE = (
@@ -258,7 +256,7 @@ def serve(cores: int, memory: int) -> NoReturn:
     os.dup2(2, 1)
     machine.use(cores=cores, memory=memory)
     _limit(memory)
-    _die_with_parent()
+    die_with_parent()
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(calls, inbox), daemon=True).start()
     while True:
@@ -295,13 +293,3 @@ def _limit(memory: int) -> None:
             import resource
 
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-
-
-def _die_with_parent() -> None:
-    """Have the system end this process with its parent (on Linux), even in the midst of a library's call."""
-    parent = os.getppid()
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(0)

@@ -14,6 +14,7 @@ import shapely
 from vinemap import __version__, naming, paths
 from vinemap.cloud.files import cloud_files, date_of, shows_tops
 from vinemap.cloud.formats.identity import digest_of, stamp_of
+from vinemap.cloud.pdal.engine import made_by
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import points_near, read_parcel
@@ -172,6 +173,8 @@ class Recipe(NamedTuple):
             "settings": self.settings.model_dump(mode="json"),
             "survey": self.survey,
         }
+        if made := made_by(self.settings.ground):
+            parts["engine"] = made
         if self.known:
             lines = self.known.lines
             shapes = shapely.to_wkb(lines.geometry.to_numpy(), hex=True).tolist()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import shapely
 
 from vinemap import __version__
-from vinemap.cloud.pdal import pdal_versions
+from vinemap.cloud.pdal.engine import made_by
 from vinemap.evaluate.meshes import NUMBERS
 from vinemap.geo.place import doubts_of
 from vinemap.product.json_values import jsonable
@@ -124,7 +124,7 @@ def record_of(
         + sight_notices(layers["rows"], layers["row_ends"])
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
         + [SQUARE] * (square and not recipe.known),
-        "versions": versions | (pdal_versions() if recipe.settings.ground.engine == "pdal" else {}),
+        "versions": versions | made_by(recipe.settings.ground),
     }
 
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
     from vinemap.surfaces.seen import Seen
 
+PDALS = {"filter", "smrf", "csf", "pmf", "pipeline"}
+"""Settings of PDAL, which has classified the points before."""
+
 
 def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Raster, Seen]:
     """Find a cloud's terrain.
@@ -29,7 +32,7 @@ def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Rast
     seen : Seen
         What the cloud shows.
     """
-    dtm = terrain_model(points, **settings.ground.model_dump())
+    dtm = terrain_model(points, **settings.ground.model_dump(exclude=PDALS))
     cloud, chm = heights_of_vines(points, dtm, resolution=settings.ground.resolution, high=settings.cover.high)
     seen = seen_cells(points, grid_over(*points.extent, resolution=settings.cover.resolution))
     machine.give_back()

@@ -1,4 +1,4 @@
-"""The box about a polygon, in the CRS of a file that is read only there."""
+"""Boxes in the CRS of a file: about a polygon, where only that is read, and the one that its header states."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from vinemap.geo.crs import horizontal, project
 from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from pyproj import CRS
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 
 MARGIN = 0.001
 """Share of its wider side that is added all around, as straight lines of one CRS bend in another."""
+LOOSE = 0.003
+"""Share of its widest side by which points may lie outside of the box that a header states."""
+MOST_OUTSIDE, STRAYS = 0.0001, 3
+"""Share of the points that may lie farther outside, and a number of them that always may."""
 
 
 def box_about(boundary: Boundary | None, header: Any, crs: CRS | None, path: Path) -> Box:
@@ -39,3 +44,20 @@ def box_about(boundary: Boundary | None, header: Any, crs: CRS | None, path: Pat
 def meet(low: Floats, high: Floats, box: Box) -> bool:
     """Whether what lies between two corners (3,) has something in common with a box."""
     return bool((low <= box[1]).all() and (high >= box[0]).all())
+
+
+def stated_box(header: Any) -> Box | None:
+    """Corners (3,) between which a header says that the points lie, with some room; None if it says nothing."""
+    low, high = header.mins, header.maxs
+    if not (np.isfinite([low, high]).all() and (high > low)[:2].all()):
+        return None
+    room = LOOSE * (high - low).max()
+    return low - room, high + room
+
+
+def n_outside(columns: Sequence[Floats] | Floats, box: Box | None) -> int:
+    """How many points, of which there are three columns (n,) of coordinates, lie outside of a box."""
+    within = list(zip(columns, *box, strict=True)) if box and len(columns[0]) else []
+    if all(low <= column.min() and column.max() <= high for column, low, high in within):
+        return 0
+    return int(np.any([(column < low) | (column > high) for column, low, high in within], axis=0).sum())

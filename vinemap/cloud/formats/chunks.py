@@ -17,6 +17,7 @@ from vinemap.cloud.formats.remote import read_remote
 from vinemap.cloud.formats.surface import read_surface
 from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.formats.told import Header, reading
+from vinemap.cloud.pdal.reader import read_pdal
 from vinemap.errors import InputError
 from vinemap.geo.place import check_place, doubts_of
 from vinemap.geo.stated import crs_of, examined
@@ -39,7 +40,7 @@ WORDS = {"text": "text", "surface": "GeoTIFF", "remote": "COPC"}
 
 
 def other_chunks(
-    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str]
+    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str], *, engine: str = "vinemap"
 ) -> Generator[tuple[Floats, CRS]]:
     """Coordinates (n, 3) of a file's usable points, chunk by chunk, and their CRS; what is to be known is added.
 
@@ -51,9 +52,7 @@ def other_chunks(
         If it can't be read now.
     """
     kind, named = kind_of(path) or "", _named(path)
-    if kind in WHOLE and not path.is_file():
-        raise InputError(f"{path}: no such file")
-    points = WHOLE[kind](path) if kind in WHOLE else PARTS[kind](path, crs, around)
+    points = _opened(path, kind, crs, around, engine)
     with closing(points.chunks) as chunks, reading(path, WORDS.get(kind, kind.upper())):
         first = next((chunk for chunk in chunks if len(chunk)), None)
         if first is None and around is None:
@@ -67,6 +66,16 @@ def other_chunks(
         for chunk in chunks:
             if len(chunk):
                 yield chunk, source
+
+
+def _opened(path: Path, kind: str, crs: CRS | None, around: Boundary | None, engine: str) -> Points:
+    if engine == "pdal" and kind != "surface":  # of which PDAL has bands, and no points
+        return read_pdal(path, crs, around)
+    if kind in PARTS:
+        return PARTS[kind](path, crs, around)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    return WHOLE[kind](path)
 
 
 def _named(path: Path) -> Path:

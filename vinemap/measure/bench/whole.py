@@ -7,6 +7,7 @@ through every cluster; and the convex hulls of slabs of its points.
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from importlib.metadata import version
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.cloud.pdal import ground_pipeline, load_pdal, pdal_versions
+from vinemap.cloud.pdal.engine import load_pdal, pdal_versions, stages_of
+from vinemap.config.settings import GroundOptions
 from vinemap.errors import DependencyError
 from vinemap.measure.bench.alternatives import CANOPY, cloth, course
 
@@ -85,7 +87,9 @@ def above_ground(xyz: Floats) -> tuple[Floats, Floats, str]:
     except DependencyError:
         by = f"cloth-simulation-filter {version('cloth-simulation-filter')}"
         return xyz, xyz[:, 2] - soil_at(xyz[cloth(xyz)], xyz[:, :2]), by
-    pipeline = ground_pipeline(xyz) | pdal.Filter.hag_nn()
+    stages = [*stages_of(GroundOptions(engine="pdal")), {"type": "filters.hag_nn"}]
+    given = np.ascontiguousarray(xyz).view([(name, "f8") for name in "XYZ"]).ravel()
+    pipeline = pdal.Pipeline(json.dumps(stages), arrays=[given])
     pipeline.execute()
     points = np.concatenate(pipeline.arrays)
     xyz = np.column_stack([points[name] for name in "XYZ"])
