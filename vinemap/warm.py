@@ -140,6 +140,7 @@ def model_canopies_of_none() -> None:
     from vinemap.canopy.foliage import separate_canopy
     from vinemap.canopy.model import model_sections
     from vinemap.canopy.points import Sections
+    from vinemap.evaluate.meshes import distances
     from vinemap.geo.crs import parse_crs
 
     m, each = 20, 50
@@ -148,7 +149,8 @@ def model_canopies_of_none() -> None:
     start, places = np.arange(m + 1) * each, np.column_stack([position, np.zeros((m, 2))])
     heights = leaves[:, 1].astype(np.float32)
     sections = Sections(np.zeros(m, dtype=np.int64), position, places, along, spacing, start, leaves, heights, member)
-    model_sections([separate_canopy(sections)], parse_crs("EPSG:32632"))
+    model = model_sections([separate_canopy(sections)], parse_crs("EPSG:32632"))
+    distances(model.at.origin, np.arange(len(model.polygons)), model.at, model.polygons, step=LENGTH)
 
 
 def _leaves(n: int) -> NDArray[np.float64]:
