@@ -150,7 +150,8 @@ def model_canopies_of_none() -> None:
     heights = leaves[:, 1].astype(np.float32)
     sections = Sections(np.zeros(m, dtype=np.int64), position, places, along, spacing, start, leaves, heights, member)
     model = model_sections([separate_canopy(sections)], parse_crs("EPSG:32632"))
-    distances(model.at.origin, np.arange(len(model.polygons)), model.at, model.polygons, step=LENGTH)
+    n = len(model.polygons)
+    distances(np.zeros((n, 3)), np.arange(n), model.at, model.polygons, step=LENGTH)
 
 
 def _leaves(n: int) -> NDArray[np.float64]:
