@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SIZE = 1600, 1000
 """Pixels of the window and of the picture."""
 TITLE = "vinemap"
-STEEP, ZOOM = 0.7, 0.42
+STEEP, ZOOM = 0.7, 0.6
 """How much a picture looks down, and Open3D's zoom."""
 THICK = 0.06
 """Metres to each side that the ribbons of rows are wide."""
@@ -88,7 +88,8 @@ def _draw(held: dict[str, Any], png: str | None) -> bool:
     for shape in _shapes(open3d, held):
         window.add_geometry(shape)
     view = window.get_view_control()
-    view.set_lookat(np.zeros(3))
+    shown = np.concatenate([held[name] for name in ("points", "vertices", "row_vertices")])
+    view.set_lookat((shown.min(axis=0) + shown.max(axis=0)) / 2 if len(shown) else np.zeros(3))
     view.set_up(np.array([0.0, 0.0, 1.0]))
     view.set_front(held["look"])
     view.set_zoom(ZOOM)
