@@ -77,11 +77,19 @@ def test_unrelated_frames_and_those_beyond_show_little_of_the_same():
 
 
 def test_a_follower_without_error_arrives_and_one_that_stands_still_does_not():
-    followers = {"still": lambda frames: STILL, "straight": lambda frames: Pose(61.0 * (len(frames) - 1), 0, 0)}
+    straight, sd = Pose(0, 0, 0), np.diag([10.0, 10.0, 1.0])
+    followers = {
+        "still": lambda _: (STILL, None),
+        "straight": lambda frames: (straight._replace(x_mm=61.0 * (len(frames) - 1)), sd**2),
+        "unsure": lambda frames: (straight._replace(x_mm=61.0 * (len(frames) - 1)), 4 * sd**2),
+    }
     found = drifts(["grass"], 1, followers=followers, length_mm=400.0)
     assert found["still"].place == pytest.approx([1000 * 0.98], rel=0.03)  # all of the way, with its turn
     assert found["straight"].place[0] < 0.2 * found["still"].place[0]
     assert found["still"].turn == pytest.approx(found["straight"].turn)
+    assert np.isnan(found["still"].squared).all()
+    assert found["straight"].squared == pytest.approx(4 * found["unsure"].squared)
+    assert found["straight"].squared[0] > (0.35 * found["straight"].turn[0]) ** 2
 
 
 def test_overall_is_the_mean_of_the_grounds_and_the_worst_the_worst():
@@ -133,8 +141,12 @@ def test_troubles_are_held_against_their_bars():
 
 def test_paths_and_times_are_held_against_their_bars():
     ends = zip(METHODS, (8, 4, 2, 2.4), (1, 1, 1, 0.2), strict=True)
-    drift = {method: Drift(np.array([place, place]), np.array([turn, turn])) for method, place, turn in ends}
+    squared = np.array([2.0, 4.0])
+    drift = {method: Drift(np.full(2, place), np.full(2, turn), squared) for method, place, turn in ends}
     assert misses(drift_table(drift)) == ["30!", "0.200!, 0.200"]
+    assert drift_table(drift)[0][-1].endswith("(0.6–7.2)")
+    drift["aligned"] = drift["aligned"]._replace(squared=np.array([7.0, 9.0]))
+    assert misses(drift_table(drift))[-1] == "8.00!"
     slow = Size(0.2, {"320 × 240": 0.01, "1280 × 720": 0.05}, 90.0, {})
     assert misses(size_table([slow], 0.02)) == ["10.0!, 9.0"]
     assert misses(size_table([slow._replace(share=0.1)], 0.02)) == []

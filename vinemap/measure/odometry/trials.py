@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from vinemap.odometry.step import Strategy
     from vinemap.simulate.steps import Step
 
-    Follower = Callable[[Sequence[Image]], Pose]
-    """Movement from the first frame of a path to its last."""
+    Follower = Callable[[Sequence[Image]], tuple[Pose, Values | None]]
+    """Movement from the first frame of a path to its last, and its covariance (3, 3) in mm and degrees if told."""
 
     ByMethod = Mapping[Method, "Errors"]
 
@@ -98,12 +98,14 @@ class Size(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """Error at the end of paths over their length."""
+    """Error at the end of paths."""
 
     place: Values
-    """Millimetres a metre (n,)."""
+    """Millimetres a metre (n,) of their length."""
     turn: Values
     """Degrees a metre (n,)."""
+    squared: Values
+    """Squared error (n,) in what the covariance tells of it, 3 on the mean if that is right; NaN if none is told."""
 
 
 def template_offset(movement: Pose, truth: Pose, camera: Camera) -> Values:
@@ -202,17 +204,17 @@ def seconds_of(
     return float(np.median(took[1:]))
 
 
-def step_by_step(frames: Sequence[Image], *, method: Method) -> Pose:
+def step_by_step(frames: Sequence[Image], *, method: Method) -> tuple[Pose, None]:
     """Movement from the first frame to the last, by those from each to the next."""
     steps = (estimate_motion(*pair, camera=LOW, method=method).movement for pair in pairwise(frames))
-    return reduce(onward, steps, STILL)
+    return reduce(onward, steps, STILL), None
 
 
-def by_keyframes(frames: Sequence[Image]) -> Pose:
+def by_keyframes(frames: Sequence[Image]) -> tuple[Pose, Values]:
     """The same by :func:`vinemap.odometry.track.follow`."""
     named = (Frame(str(k), None, image) for k, image in enumerate(frames))
     (last,) = deque(follow(named, camera=LOW), maxlen=1)
-    return last.pose
+    return last.pose, last.covariance
 
 
 FOLLOWERS: dict[str, Follower] = {
@@ -233,11 +235,20 @@ def drifts(
     poses = [pose._replace(x_mm=pose.x_mm - length_mm / 2 - LOW.x_mm) for pose in sinusoid(length_mm=length_mm)]
     length = sum(float(np.hypot(*moved(*step)[:2])) for step in pairwise(poses)) / 1000
     size = length_mm + 700.0, 1100.0
-    gathered: dict[str, list[tuple[float, float]]] = {name: [] for name in followers}
+    gathered: dict[str, list[tuple[float, float, float]]] = {name: [] for name in followers}
     for k in range(count):
         ground = lay_ground(grounds[k % len(grounds)], size_mm=size, seed=seed + k)
         frames = [render(ground, pose, seed=1000 * (seed + k) + i) for i, pose in enumerate(poses)]
         for name, followed in followers.items():
-            off = moved(moved(poses[0], poses[-1]), followed(frames))
-            gathered[name].append((float(np.hypot(*off[:2])) / length, abs(off.heading_deg) / length))
+            pose, covariance = followed(frames)
+            off = moved(moved(poses[0], poses[-1]), pose)
+            squared = np.nan if covariance is None else _squared(moved(poses[0], poses[-1]), pose, covariance)
+            gathered[name].append((float(np.hypot(*off[:2])) / length, abs(off.heading_deg) / length, squared))
     return {name: Drift(*np.transpose(errors)) for name, errors in gathered.items()}
+
+
+def _squared(truth: Pose, pose: Pose, covariance: Values) -> float:
+    """Squared error of a pose, normalised by its covariance."""
+    turn = (pose.heading_deg - truth.heading_deg + 180) % 360 - 180
+    off = np.array([pose.x_mm - truth.x_mm, pose.y_mm - truth.y_mm, turn])
+    return float(off @ np.linalg.solve(covariance, off))
