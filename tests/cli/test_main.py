@@ -57,7 +57,7 @@ def test_classified_clouds_and_plain_meshes_on_demand(tmp_path, survey):
     leaves, others = ((np.asarray(cloud.classification) == 5).sum() for cloud in (las, far))
     assert others > 0.97 * leaves
     record = json.loads((tmp_path / "asked" / "run.json").read_text())
-    assert record["settings"]["product"] == {"classified": True, "plain": True, "geoid": None}
+    assert record["settings"]["product"] == {"classified": True, "plain": True, "audit": False, "geoid": None}
     assert "small_classified.laz" in record["files"]
     assert 0 < record["modelling"]["over"] < 0.09
 

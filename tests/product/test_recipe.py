@@ -62,8 +62,9 @@ def test_the_key_tells_each_ingredient(made, cloud, boundaries, tmp_path, monkey
 def test_every_setting_is_in_the_key(made, stage):
     """One other value of one setting of each stage."""
     options = getattr(Settings(), stage)
-    numbers = {k: v for k, v in options.model_dump().items() if isinstance(v, (int, float)) or not v}
-    name, value = next(iter((numbers or options.model_dump()).items()))
+    values = options.model_dump()
+    numbers = {k: v for k, v in values.items() if isinstance(v, (int, float))}
+    name, value = next(iter((numbers or {k: v for k, v in values.items() if not v} or values).items()))
     other = {type(None): 1000, bool: not value, str: "keep"}.get(type(value))
     changed = options.model_copy(update={name: value + 1 if other is None else other})
     assert made._replace(settings=Settings().model_copy(update={stage: changed})).key != made.key

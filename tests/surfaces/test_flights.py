@@ -8,9 +8,10 @@ from vinemap.cloud.points import PointCloud
 from vinemap.config.settings import Settings
 from vinemap.surfaces.flights import disagreement
 from vinemap.surfaces.ground import terrain_model
+from vinemap.surfaces.map import PDALS
 
 SIDE, DENSITY = 30.0, 60.0
-SURFACE = Settings().ground.model_dump()
+SURFACE = Settings().ground.model_dump(exclude=PDALS)
 
 
 def over(surface, *, noise=0.025, seed=0):
