@@ -132,6 +132,5 @@ def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Cal
     canopies = step("Sections", find_canopies, *cut, settings)
     options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
     model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
-    del canopies
     machine.give_back()
     return model

@@ -97,13 +97,15 @@ def make_product(
         about |= {"n_key_points": found.n_key_points, "remarks": [*found.remarks, *strays]}
         record = record_of(recipe, found.cloud, layers, surfaces, **about)
 
+        cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
+        del found, model  # much memory, that writing needs
+
         def write() -> list[str]:
             how = settings.product.model_dump(include={"plain", "geoid", "audit"})
             remarks = write_product(draft, record, layers, rasters, meshes, points, **how)
-            if settings.product.classified:
-                cut = found.cloud, found.rows, found.gaps, found.dtm
+            if cut:
                 classify = partial(classify_points, leaves=find_leaves(*cut, settings))
-                write_classified(found.cloud, classify, paths.classified_cloud(draft, parcel))
+                write_classified(cut[0], classify, paths.classified_cloud(draft, parcel))
             written.result()
             return remarks
 

@@ -15,11 +15,10 @@ from vinemap.canopy.numbers import Measures, measure_sections, tabulate_sections
 from vinemap.canopy.peeling import peel_sections
 from vinemap.canopy.points import join
 from vinemap.canopy.sections import cut_sections
+from vinemap.compute import machine
 from vinemap.compute.threads import in_threads
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import geopandas as gpd
     from numpy.typing import NDArray
     from pyproj import CRS
@@ -83,14 +82,14 @@ def find_leaves(
 
 
 def model_sections(
-    canopies: Sequence[Canopy], crs: CRS, *, c: int = 7, share: float = 0.02, foot: str = "foliage", min_points: int = 8
+    canopies: list[Canopy], crs: CRS, *, c: int = 7, share: float = 0.02, foot: str = "foliage", min_points: int = 8
 ) -> CanopyModel:
     """Model the canopies of sections by polygons (section 3.2).
 
     Parameters
     ----------
-    canopies : sequence of Canopy
-        One a row.
+    canopies : list of Canopy
+        One a row. They are taken from the list as they are modelled, as all together they are large.
     crs : CRS
         Of their places.
     c : int
@@ -103,7 +102,9 @@ def model_sections(
         Canopy points of a section; above a foot that the sections around tell half of them do.
     """
     model_row = partial(_model_row, c=c, share=share, on_foliage=foot == "foliage", least=max(3, min_points // 2))
-    models = in_threads(model_row, canopies or [NO_CANOPY])
+    canopies.reverse()
+    models = in_threads(model_row, (canopies.pop() for _ in range(len(canopies))) if canopies else [NO_CANOPY])
+    machine.give_back()
     at = join([model.at for model in models])
     polygons = np.concatenate([model.polygons for model in models])
     measures = Measures(*(np.concatenate(column) for column in zip(*(m.measures for m in models), strict=True)))

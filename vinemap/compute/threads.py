@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
@@ -26,12 +27,13 @@ _here = threading.local()
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
     """Results of a function for each item, in their order, worked out on all cores where it lets go of the GIL.
 
-    Within one of its own threads it does one after the other. When one fails, nothing goes on behind its error.
+    Within one of its own threads it does one after the other. When one fails, nothing goes on behind its error. An item
+    that nobody else holds is let go of once it is done.
     """
-    work = list(items)
+    work = deque(items)
     if len(work) < 2 or getattr(_here, "busy", False):
-        return [function(item) for item in work]
-    jobs = [_pool().submit(function, item) for item in work]
+        return [function(work.popleft()) for _ in range(len(work))]
+    jobs = [_pool().submit(function, work.popleft()) for _ in range(len(work))]
     try:
         return [job.result() for job in jobs]
     except BaseException:

@@ -50,7 +50,7 @@ PLANE = 0.5
 """Share of the patches' disagreement that is left if it is that of a plane that is tilted."""
 SHORT = 12.0
 """Pixels of movement below which parallax says nothing of a tilt."""
-ALIKE = 2.0
+ALIKE = 1.6
 """How much more patches vary together than each for itself, as neighbours err alike."""
 LEAST_SPREAD = 0.015
 """Pixels by which patches disagree at least."""
