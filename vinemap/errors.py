@@ -48,3 +48,8 @@ class WorkerError(VinemapError):
 def own_fault(error: BaseException, where: str = "") -> str:
     """What is said of an error that vinemap didn't raise on purpose."""
     return f"a fault of vinemap's own ({type(error).__name__}: {error}{where})"
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, in one line; its kind, if it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__

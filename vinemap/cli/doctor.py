@@ -85,14 +85,14 @@ def _extras() -> Iterator[tuple[str, str]]:
 
     from vinemap.cloud.pdal.engine import pdal_versions
     from vinemap.compute.extras import EXTRAS, load
-    from vinemap.errors import DependencyError
+    from vinemap.errors import DependencyError, reason_of
 
     owners = packages_distributions()
     for module, extra in EXTRAS.items():
         try:
             load(module)
         except DependencyError as error:
-            yield extra.library, " ".join(str(error).split())
+            yield extra.library, reason_of(error)
         else:
             yield extra.library, version(owners[module][0]) if module in owners else "is there"
     try:

@@ -35,6 +35,7 @@ for command in (warm, doctor, qgis_plugin):
 
 def main() -> None:
     """Run a command of the command line."""
+    gc.set_threshold(100_000)  # what is imported lives on: seldom looked through for garbage
     os.environ.setdefault("NUMBA_OPT", "1")  # compiles in a tenth less time what is as fast
     with hushed(), plain_errors():
         commands.main(prog_name="vinemap", standalone_mode=False)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,7 +10,6 @@ from vinemap.cli.options import FILE, OriginParam
 from vinemap.terminal import progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 
@@ -53,14 +50,13 @@ def run(
 
     They are LAS, LAZ, COPC (also as https://…), EPT, E57, PLY, PCD, XYZ or CSV, or a surface model as GeoTIFF.
     """
-    with _importing():
-        from vinemap import paths
-        from vinemap.cloud.files import cloud_files
-        from vinemap.config.names import check_parcel
-        from vinemap.config.settings import Settings
-        from vinemap.config.surveys import load_settings
-        from vinemap.geo.crs import parse_crs
-        from vinemap.warm import ahead
+    from vinemap import paths
+    from vinemap.cloud.files import cloud_files
+    from vinemap.config.names import check_parcel
+    from vinemap.config.settings import Settings
+    from vinemap.config.surveys import load_settings
+    from vinemap.geo.crs import parse_crs
+    from vinemap.warm import ahead
 
     survey = paths.named_by(cloud_files(clouds))
     name = check_parcel(parcel) if parcel is not None else survey
@@ -78,26 +74,7 @@ def run(
         "named": parcel is not None,
     }
     with progress(name) as bar, ahead(bar) as step:
-        with _importing():
-            from vinemap.parcel import map_parcel
+        from vinemap.parcel import map_parcel
 
-        def stage(name: str, *args: Any, **kwargs: Any) -> Any:
-            out = step(name, *args, **kwargs)
-            if name == "Reading":
-                with _importing():
-                    import vinemap.making  # noqa: F401 - what could be read is worked on next
-            return out
-
-        summary = map_parcel(clouds, folder, parcel=name, step=stage, **options)
+        summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
     click.echo(summary.line())
-
-
-@contextmanager
-def _importing() -> Iterator[None]:
-    """What is imported lives on: it isn't looked through for garbage, neither meanwhile nor later (0.1 s each time)."""
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()

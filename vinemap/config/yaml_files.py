@@ -11,7 +11,7 @@ import yaml
 from pydantic import AfterValidator, ValidationError
 
 from vinemap.config.settings import Options
-from vinemap.errors import ConfigError, InputError
+from vinemap.errors import ConfigError, InputError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +80,7 @@ def read_yaml(path: Path) -> Any:
     except OSError as error:
         raise ConfigError(f"{path}: can't be read ({error.strerror})") from error
     except Exception as error:  # a YAMLError, or others of tags in odd places
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise ConfigError(f"{path}: no valid YAML ({reason})") from error
     return {} if data is None else data
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap import __version__, naming, paths
-from vinemap.errors import InputError
+from vinemap.errors import InputError, reason_of
 from vinemap.export import MESHES, TABLE
 from vinemap.export.agopengps import write_agopengps
 from vinemap.export.field import products_of, read_field
@@ -113,7 +113,7 @@ def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, 
         try:
             write(draft)
         except (DataSourceError, DataLayerError, FeatureError) as error:
-            raise OSError(" ".join(str(error).split())) from error
+            raise OSError(reason_of(error)) from error
         record["files"] = sorted(path.relative_to(draft).as_posix() for path in draft.rglob("*") if path.is_file())
         paths.run_record(draft).write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 

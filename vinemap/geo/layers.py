@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap.errors import InputError
+from vinemap.errors import InputError, reason_of
 from vinemap.geo.crs import LOCAL, WGS84, is_local
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def read_layers(
     except InputError:
         raise
     except Exception as error:  # GDAL's errors come in several classes
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         formats = f"GeoPackage, GeoJSON, KML, KMZ{', DXF' if drawn else ''} or Shapefile"
         raise InputError(f"{path}: can't be read as {formats} ({reason})") from error
     nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84 if path.suffix.lower() in KML else None)

@@ -199,9 +199,8 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
         if recipe.boundary is not None:
             dealt.setdefault(recipe.settings.ground.engine, []).append(recipe)
     together = [recipes for recipes in dealt.values() if len(recipes) > 1]
-    for recipe in plan.recipes:
-        if not any(recipe in recipes for recipes in together):
-            yield recipe, None
+    named = {recipe.parcel for recipes in together for recipe in recipes}
+    yield from ((recipe, None) for recipe in plan.recipes if recipe.parcel not in named)
     for number, recipes in enumerate(together):
         folder = aside / str(number)
         folder.mkdir()

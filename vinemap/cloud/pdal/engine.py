@@ -11,7 +11,7 @@ import json
 import re
 from typing import TYPE_CHECKING, Any
 
-from vinemap.errors import ConfigError, DependencyError
+from vinemap.errors import ConfigError, DependencyError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -38,7 +38,7 @@ def load_pdal() -> Any:
 
         _check_version(str(pdal.info.version))
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise DependencyError(
             f"ground.engine: pdal wants PDAL, which can't be loaded ({reason}): conda install -c conda-forge "
             "python-pdal, or leave ground.engine out, as vinemap has an engine of its own"

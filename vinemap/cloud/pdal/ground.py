@@ -13,7 +13,7 @@ from vinemap.cloud.pdal.engine import load_pdal, stages_of
 from vinemap.cloud.pdal.stages import classify
 from vinemap.cloud.points import PointCloud
 from vinemap.compute.apart import apart
-from vinemap.errors import InputError, VinemapError, WorkerError
+from vinemap.errors import InputError, VinemapError, WorkerError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -105,7 +105,7 @@ def _run(
     except VinemapError:
         raise
     except (RuntimeError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = reason_of(error)[:200]
         raise InputError(f"{name}: PDAL can't run it on this cloud ({reason})") from error
 
 

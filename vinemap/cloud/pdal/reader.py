@@ -18,7 +18,7 @@ from vinemap.cloud.las_end import OURS
 from vinemap.cloud.pdal.engine import load_pdal
 from vinemap.cloud.pdal.stages import read
 from vinemap.compute.apart import apart
-from vinemap.errors import BusyError, InputError, VinemapError, WorkerError
+from vinemap.errors import BusyError, InputError, VinemapError, WorkerError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -114,7 +114,7 @@ def _said_of(path: Path) -> Iterator[None]:
     except VinemapError:
         raise
     except (RuntimeError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = reason_of(error)[:200]
         raise InputError(f"{path}: can't be read by PDAL ({reason}): is it whole?") from error
 
 

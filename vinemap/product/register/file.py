@@ -21,7 +21,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from vinemap import paths
-from vinemap.errors import BusyError, InputError, OutputError
+from vinemap.errors import BusyError, InputError, OutputError, reason_of
 from vinemap.geo.crs import project
 from vinemap.geo.lines import LAST_NUMBER, ROW_LAYER, as_rows
 from vinemap.product.geopackage import write_geopackage
@@ -175,7 +175,7 @@ def _add_layers(path: Path) -> None:
             how = {"geometry_type": layer.geometry, "layer_options": {"GEOMETRY_NAME": "geom"}}
             pyogrio.write_dataframe(_empty(layer, crs), path, layer=name, driver="GPKG", append=True, **how)
     except (DataSourceError, DataLayerError, FeatureError) as error:
-        reason = " ".join(str(error).split())
+        reason = reason_of(error)
         raise OutputError(f"{path}: can't be written ({reason}): the register stays as it was") from error
 
 
