@@ -90,11 +90,13 @@ def map_rows(
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     options["fit"]["high"] = settings.cover.high
-    key_points: Any = ()
+    n_key_points = 0
     if lines is None:
         key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
+        n_key_points = len(key_points)
         clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
+        del key_points, clusters  # much memory
     else:
         lines, within = space_lines(lines, field), None
         courses = step("Curves", follow_lines, lines, cover, **_how(settings))
@@ -113,8 +115,8 @@ def map_rows(
         rows, gaps, told = name_rows(lines, courses, flag_rows(rows), gaps)
         remarks = *remarks, *told
     rows, gaps = count_missing(rows, gaps, **options["missing"])
-    field, n = refine_row_field(field, rows), len(key_points)
-    return RowMap(cloud, dtm, chm, cover, seen, field, n, rows, gaps, remarks, shift)
+    field = refine_row_field(field, rows)
+    return RowMap(cloud, dtm, chm, cover, seen, field, n_key_points, rows, gaps, remarks, shift)
 
 
 def _how(settings: Settings) -> dict[str, Any]:

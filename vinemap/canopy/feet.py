@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
     above = canopy.points[:, 1] <= np.repeat(foot + FOOT_BAND, np.diff(canopy.start))
     # Points higher up go to a bin of their own, that doesn't count.
-    half = FOOT_BIN * np.ceil(np.abs(canopy.points[:, 0]).max(initial=FOOT_BIN) / FOOT_BIN + 1)
+    half = FOOT_BIN * math.ceil(float(np.abs(canopy.points[:, 0]).max(initial=FOOT_BIN)) / FOOT_BIN + 1)
     across = np.where(above, canopy.points[:, 0], 2 * half)
     widths = _pooled(_histograms(across, canopy.start, -half, FOOT_BIN, round(2 * half / FOOT_BIN) + 1)[:, :-1], near)
     right, left = (_rank(widths, q) * FOOT_BIN - half for q in (1 - FOOT_SPREAD, FOOT_SPREAD))

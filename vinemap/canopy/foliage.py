@@ -115,7 +115,9 @@ def living_canopies(canopies: Sequence[Canopy], *, min_points: int = 8, min_shar
     for sections, soil, tall in canopies:
         own = np.diff(sections.start)
         enough = (own >= least) & (tall >= TALL)
-        if enough.any():
+        if enough.all():
+            out.append(Canopy(sections, soil, tall))
+        elif enough.any():
             out.append(Canopy(sections.subset(np.repeat(enough, own), enough), soil[enough], tall[enough]))
     return out
 

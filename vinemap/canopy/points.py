@@ -98,7 +98,7 @@ class Sections(NamedTuple):
     """Local inter-row spacing δ (m,) in metres."""
     start: Ints
     """First point (m + 1,) of each section."""
-    points: Values
+    points: NDArray[np.float32]
     """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
     height: Values
     """Height above the terrain model (n,) in metres."""
@@ -111,7 +111,8 @@ class Sections(NamedTuple):
         n = np.zeros(len(sections), dtype=np.int64)
         in_threads(lambda part: _count_flags(*part, points, self.start, n), stretches(len(n)))
         start = np.concatenate([[0], np.cumsum(n)])
-        kept, height = np.empty((start[-1], 2)), np.empty(start[-1], dtype=self.height.dtype)
+        kept = np.empty((start[-1], 2), dtype=self.points.dtype)
+        height = np.empty(start[-1], dtype=self.height.dtype)
         member = np.empty(start[-1], dtype=self.member.dtype)
         old, new = (self.points, self.height, self.member), (kept, height, member)
         in_threads(lambda part: _take_flagged(*part, points, self.start, start, old, new), stretches(len(n)))
@@ -139,7 +140,7 @@ NO_SECTIONS = Sections(
     np.empty((0, 2)),
     np.empty(0),
     np.zeros(1, dtype=np.int64),
-    np.empty((0, 2)),
+    np.empty((0, 2), dtype=np.float32),
     np.empty(0, dtype=np.float32),
     np.empty(0, dtype=np.int32),
 )

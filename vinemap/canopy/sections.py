@@ -81,9 +81,8 @@ def cut_sections(
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
         position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
-        across = left.astype(float)
-        top, half = canopy_size(across, height, float(spacing[row]), high)
-        below = min(SOIL, canopy_floor(across, height, (top, half), float(spacing[row])))
+        top, half = canopy_size(left, height, float(spacing[row]), high)
+        below = min(SOIL, canopy_floor(left, height, (top, half), float(spacing[row])))
         canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
         length = max(len(position) * step, step)
         a = max(width, min(max_width, min_points * length / max(canopy, 1)))
@@ -215,10 +214,10 @@ def _take_each(
     member: NDArray[np.int32],
     start: Ints,
     level: Values,
-) -> tuple[Values, Values, NDArray[np.int32]]:
+) -> tuple[NDArray[np.float32], Values, NDArray[np.int32]]:
     """Points (n, 2) of sections whose soil lies at ``level`` (m,), their heights, and which of the cloud's they are."""
     n = len(index)
-    points, heights, members = np.empty((n, 2)), np.empty(n, height.dtype), np.empty(n, member.dtype)
+    points, heights, members = np.empty((n, 2), height.dtype), np.empty(n, height.dtype), np.empty(n, member.dtype)
     for k in range(len(level)):
         for i in range(start[k], start[k + 1]):
             p = index[i]
