@@ -178,13 +178,13 @@ def _seen(points: Values, heights: Values, start: Ints, middle: Values, bottom: 
     out = np.zeros(len(middle))
     for k in range(len(middle)):
         n = max(math.ceil((top[k] - bottom[k]) / CELL), 1)
-        shown, cells = np.zeros((2, n), dtype=np.bool_), 0
+        shown, cells = np.zeros((2, n)), 0
         for p in range(start[k], start[k + 1]):
             i = int((heights[p] - bottom[k]) / CELL)
             if 0 <= i < n and heights[p] >= bottom[k]:
                 side = int(points[p, 0] > middle[k])
-                cells += not shown[side, i]
-                shown[side, i] = True
+                cells += shown[side, i] == 0
+                shown[side, i] = 1
         out[k] = cells / (2 * n)
     return out
 

@@ -195,11 +195,11 @@ def canopy_size(left: Values, height: Values, spacing: float, highest: float) ->
     spacing, highest : float
         Metres to the next row, and of height above which there is no canopy.
     """
-    levels = np.zeros(int(highest / BIN) + 1)
+    levels, total = np.zeros(int(highest / BIN) + 1), 0
     for p in range(len(left)):
         if LEAST <= height[p] <= highest and abs(left[p]) <= 0.25 * spacing:
             levels[int(height[p] / BIN)] += 1
-    total = levels.sum()
+            total += 1
     if total == 0:
         return highest, 0.5 * spacing
     bins, below = 1, levels[0]

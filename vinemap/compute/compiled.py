@@ -34,14 +34,17 @@ _one_at_a_time = threading.Lock()
 
 
 def compiled(function: F) -> F:
-    """Compile a function at its first call, for threads without the GIL, and keep it for later processes."""
+    """Compile a function at its first call, for threads without the GIL, and keep it for later processes.
+
+    In it, too, divisions by zero are as numpy's.
+    """
     where = folder()
     if where is None:
-        return cast("F", njit(nogil=True)(function))
+        return cast("F", njit(nogil=True, error_model="numpy")(function))
     with _one_at_a_time:  # numba reads where to keep a function when that is decorated, from what all of it shares
         elsewhere, config.CACHE_DIR = config.CACHE_DIR, str(where)
         try:
-            return cast("F", njit(cache=True, nogil=True, no_cfunc_wrapper=True)(function))
+            return cast("F", njit(cache=True, nogil=True, no_cfunc_wrapper=True, error_model="numpy")(function))
         finally:
             config.CACHE_DIR = elsewhere
 

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Floats, Values
 
-MIRRORED, CARRIED_ON = 0, 1
-"""What lies beyond the edges: the image again, or its outermost values."""
+MIRRORED, CARRIED_ON = 0.0, 1.0
+"""What lies beyond the edges: the image again, or its outermost values. No whole numbers, which compile one by one."""
 
 
 @compiled
-def blurred_down(image: Values, sigma: float, edge: int) -> Values:
+def blurred_down(image: Values, sigma: float, edge: float) -> Values:
     """Image (n, m) smoothed along its columns by a Gaussian of a standard deviation in cells, cut off at four."""
     n, m = image.shape
     radius = int(4 * sigma + 0.5)

@@ -42,7 +42,13 @@ def _placed(position: Values, way: Values, vertices: Values) -> Values:
     for i in range(len(position)):
         at = position[i]
         if at < way[k] or (k + 2 < n and at >= way[k + 2]):
-            k = max(np.searchsorted(way, at, "right") - 1, 0)
+            k, after = 0, n
+            while k + 1 < after:  # numba's searchsorted takes as long to compile as all else here
+                middle = (k + after) // 2
+                if way[middle] <= at:
+                    k = middle
+                else:
+                    after = middle
         while k + 1 < n and way[k + 1] <= at:
             k += 1
         if k + 1 == n or at <= way[k]:

@@ -297,7 +297,11 @@ def _straighten(share: _Share, canopy: Values, shift: Values) -> tuple[Values, V
 def _cover(station: Values, left: Values, canopy: Values, shift: Values, m: int) -> Values:
     """Share of canopy (stations, 2 m + 1) in cells, smoothed the wider the fewer points there are."""
     leaves, everything = _spread(station, left, canopy, shift, m)
-    density = max(everything.sum() / everything.size, 1e-9)
+    density = 0.0
+    for i in range(len(shift)):
+        for j in range(2 * m + 1):
+            density += everything[i, j]
+    density = max(density / everything.size, 1e-9)
     sigma = max(1.0, density**-0.5)
     leaves, everything = blurred(leaves, sigma), blurred(everything, sigma)
     for i in range(len(shift)):
