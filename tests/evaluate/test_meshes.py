@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from vinemap.canopy.mesh import section_meshes
-from vinemap.canopy.numbers import judge_canopies, summarise_rows
+from vinemap.canopy.numbers import judge_canopies, quantile_of, summarise_rows
 from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.tiles import Collector
 from vinemap.compute.extras import load
@@ -46,6 +46,28 @@ def test_points_tell_the_error_that_the_true_surface_has(mapped, vineyard):
         assert np.isfinite(told).all()
         assert told.mean() == pytest.approx(true.mean(), abs=0.01)
         assert least < true.mean() < most
+
+
+def test_a_flank_that_was_not_seen_is_told_by_the_other(mapped, vineyard):
+    """One that the mesh cuts off, whether the line of the row runs along its middle or 0.15 m beside."""
+    found, model, rows = mapped
+    y, z = model.sample.points.T
+    seen = (y < 0) | (z > np.repeat(quantile_of(z, model.sample.start, 0.7), np.diff(model.sample.start)))
+    half = model.polygons * [[[0.4, 1.0]]]
+    lower = model.polygons[..., 1] < model.polygons[..., 1].max(axis=1, keepdims=True) - 0.3
+    cut = np.where((lower & (model.polygons[..., 0] > 0))[..., None], half, model.polygons)
+    other = model._replace(polygons=cut, sample=model.sample.subset(seen))
+    told, true = compare_meshes(vineyard, found, other, step=STEP)
+    assert true.mean() > 0.045
+    assert told.mean() == pytest.approx(true.mean(), abs=0.01)
+    aside = 0.15 * np.array([-1.0, 1.0]) * other.at.tangent[:, ::-1]
+    beside = other._replace(
+        at=other.at._replace(origin=other.at.origin + np.pad(aside, [(0, 0), (0, 1)])),
+        polygons=cut - [0.15, 0.0],
+        sample=other.sample._replace(points=other.sample.points - [0.15, 0.0]),
+    )
+    same = measure_meshes(found.cloud, beside, rows, step=STEP)["mesh_error_m"].to_numpy()
+    assert same == pytest.approx(told, abs=1e-6)
 
 
 def test_distances_are_those_of_open3d(mapped):

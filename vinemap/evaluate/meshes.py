@@ -7,12 +7,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from vinemap.canopy.mesh import breaks, corners_of
+from vinemap.canopy.numbers import HIGH, LOW, TOP, quantile_of
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -26,6 +30,8 @@ PATCH, PATCHES = 0.2, 12
 many of them an outline has at the least, so that those of a small canopy are narrower."""
 FEW = 30
 """Patches whose median tells an error to a centimetre; of fewer it isn't told."""
+UPPER = 2 / 3
+"""Share of a canopy's depth above which it is seen from both sides, and tells its middle."""
 SURE = 0.5
 """Confidence in a canopy below which its points don't tell where its surface is."""
 NUMBERS = ("mesh_error_m", "mesh_median_m", "mesh_95_m", "mesh_inside")
@@ -50,7 +56,8 @@ def measure_meshes(
     distances to the mesh, negative inside, and ``mesh_inside`` is the share of them that is inside: foliage is deep,
     and points lie in it. ``mesh_error_m`` is the model's part: the median of the distances of the foliage's surface to
     the mesh, on its sides and top. In each of the ``PATCHES`` the surface lies where the outermost point does, and
-    as much further out as foliage reaches beyond its points. All are NaN without a canopy, and the
+    as much further out as foliage reaches beyond its points. What one flank hides the other shows: of a patch tell its
+    own points or, where these are more, those of the other side, mirrored. All are NaN without a canopy, and the
     last where few patches have points, where ``tops`` alone were seen, and where ``canopy_confidence`` is low.
 
     Parameters
@@ -65,32 +72,58 @@ def measure_meshes(
         Metres between sections.
     """
     section = np.repeat(np.flatnonzero(model.sampled), np.diff(model.sample.start))
-    near = distances(_places(cloud, model.sample.member), section, model.at, model.polygons, step=step)
+    points, tangent = _places(cloud, model.sample.member), model.at.tangent[section]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0], np.zeros(len(section))])
+    other = points - 2 * (model.sample.points[:, :1] - _middles(model.sample)[:, None]) * normal
+    own, mirrored = (distances(p, section, model.at, model.polygons, step=step) for p in (points, other))
     row = model.at.row_id[section]
     told = {}
     ends = np.flatnonzero(np.diff(row, prepend=-1, append=-1))
     for first, last in pairwise(ends.tolist()):
         mine = slice(first, last)
-        told[int(row[first])] = _numbers(section[mine], near.distance[mine], near.patch[mine], model.reach)
-    table = np.array([told.get(int(one), (np.nan,) * len(NUMBERS)) for one in rows["row_id"]]).reshape(-1, len(NUMBERS))
+        near = [Near(side.distance[mine], side.patch[mine]) for side in (own, mirrored)]
+        told[int(row[first])] = _error(section[mine], near, model.reach), *_spread(near[0].distance)
+    nothing = (np.nan,) * len(NUMBERS)
+    table = np.array([told.get(int(one), nothing) for one in rows["row_id"]]).reshape(-1, len(NUMBERS))
     known = (rows["canopy_confidence"].to_numpy(dtype=float) >= SURE) & (not tops)
     table[~known, 0] = np.nan
     return rows.assign(**dict(zip(NUMBERS, table.T, strict=True)))
 
 
-def _numbers(section: Ints, distance: Values, patch: Ints, reach: Values) -> tuple[float, float, float, float]:
-    """The ``NUMBERS`` of a row, of whose sections are points (n,) as of :func:`distances`."""
-    known = np.isfinite(distance)
-    if not known.any():
-        return (np.nan,) * 4
-    median, most = np.quantile(distance[known], [0.5, 0.95])
-    seen = known & (patch >= 0)
-    place = (section[seen] - section[0]) * (patch[seen].max(initial=0) + 1) + patch[seen]
-    order = np.lexsort((distance[seen], place))
-    outermost = order[np.flatnonzero(np.diff(place[order], append=-1))]
-    off = distance[seen][outermost] + reach[section[seen][outermost]]
-    error = float(np.median(np.abs(off))) if len(off) >= FEW else np.nan
-    return error, float(median), float(most), float(np.mean(distance[known] <= 0))
+def _middles(sections: Sections) -> Values:
+    """Metres (n,) to the left of γ at which the canopy of each point's row has its middle, as its upper part shows it.
+
+    That is seen from all sides, where a flank may be hidden.
+    """
+    low, top = (quantile_of(sections.points[:, 1], sections.start, q) for q in (LOW, TOP))
+    upper = sections.subset(sections.points[:, 1] >= np.repeat(low + UPPER * (top - low), np.diff(sections.start)))
+    right, left = (quantile_of(upper.points[:, 0], upper.start, q) for q in (LOW, HIGH))
+    middle = pd.Series((right + left) / 2).groupby(sections.row_id).transform("median")
+    return np.repeat(middle.to_numpy(dtype=float), np.diff(sections.start))
+
+
+def _spread(distance: Values) -> tuple[float, float, float]:
+    """Median and 95% of the distances (n,) of a row's points, and the share of them inside."""
+    known = distance[np.isfinite(distance)]
+    if not len(known):
+        return (np.nan,) * 3
+    median, most = np.quantile(known, [0.5, 0.95])
+    return float(median), float(most), float(np.mean(known <= 0))
+
+
+def _error(section: Ints, sides: Sequence[Near], reach: Values) -> float:
+    """Median distance of a row's surface, of whose sections are points (n,), as they lie and mirrored."""
+    each, rank = np.unique(section, return_inverse=True)
+    width = max(side.patch.max() for side in sides) + 1
+    n, outermost = np.zeros((2, len(each) * width), dtype=int), np.full((2, len(each) * width), -np.inf)
+    for side, near in enumerate(sides):
+        seen = np.isfinite(near.distance) & (near.patch >= 0)
+        place = rank[seen] * width + near.patch[seen]
+        n[side] = np.bincount(place, minlength=n.shape[1])
+        np.maximum.at(outermost[side], place, near.distance[seen] + reach[section[seen]])
+    own, mirrored = outermost
+    off = np.where(n[0] >= n[1], own, mirrored)[n.any(axis=0)]
+    return float(np.median(np.abs(off))) if len(off) >= FEW else np.nan
 
 
 def _places(cloud: Cloud, member: NDArray[np.int32]) -> Floats:

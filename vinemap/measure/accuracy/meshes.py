@@ -51,17 +51,16 @@ def pool_meshes(errors: Sequence[MeshErrors]) -> MeshErrors:
 
 
 def true_surface(survey: Survey) -> Floats:
-    """Points (n, 3) at equal steps round the foliage of every station, leaves' reach included."""
+    """Points (n, 3) at equal steps over the foliage of every station, from foot to foot, leaves' reach included."""
     foliage = survey.foliage
     if len(foliage.row) == 0:
         return np.empty((0, 3))
-    rings = foliage_outlines(foliage)
-    rings = np.concatenate([rings, rings[:, :1]], axis=1)
-    way = np.cumsum(np.hypot(*np.diff(rings, axis=1, prepend=rings[:, :1]).transpose(2, 0, 1)), axis=1)
+    outlines = foliage_outlines(foliage)
+    way = np.cumsum(np.hypot(*np.diff(outlines, axis=1, prepend=outlines[:, :1]).transpose(2, 0, 1)), axis=1)
     n = np.maximum(np.round(way[:, -1] / APART).astype(int), 1)
     round_ = [
         np.column_stack([np.interp((np.arange(k) + 0.5) / k * along[-1], along, side) for side in ring.T])
-        for k, along, ring in zip(n, way, rings, strict=True)
+        for k, along, ring in zip(n, way, outlines, strict=True)
     ]
     station, across = np.repeat(np.arange(len(n)), n), np.concatenate(round_)
     along = _ways(foliage)[station]
