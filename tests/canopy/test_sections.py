@@ -336,14 +336,16 @@ def test_low_and_wide_canopies_keep_their_points():
 
 
 def test_posts_that_stick_out_of_low_vines_are_cut_off():
-    """Not so an old vine among young ones, nor a post no taller than the canopy."""
+    """Few points of one do, strays beside it; but no old vine among young ones, nor a post no taller than vines."""
     rng = np.random.default_rng(0)
     young = [np.column_stack([rng.uniform(-0.15, 0.15, 300), rng.uniform(0.15, 0.7, 300)]) for _ in range(40)]
     post = np.column_stack([rng.normal(0.05, 0.03, 200), rng.uniform(0.2, 2.0, 200)])
     old = np.column_stack([rng.uniform(-0.3, 0.3, 300), rng.uniform(0.2, 1.8, 300)])
-    (canopy,) = separate(many_sections([*young, np.concatenate([young[0], post]), old]))
+    strays = np.array([[-0.2, 1.2], [0.2, 1.5], [0.2, 1.6]])
+    posts = [np.concatenate([young[0], post]), np.concatenate([young[1], post[:12], strays])]
+    (canopy,) = separate(many_sections([*young, *posts, old]))
     top = np.maximum.reduceat(canopy.sections.points[:, 1], canopy.sections.start[:-1])
-    np.testing.assert_allclose(top, [*[0.7] * 41, 1.8], atol=0.05)
+    np.testing.assert_allclose(top, [*[0.7] * 42, 1.8], atol=0.05)
     tall = young[0] * [1, 2.6]
     (canopy,) = separate(many_sections([tall] * 20 + [np.concatenate([tall, post])]))
     assert canopy.sections.points[:, 1].max() == pytest.approx(2.0, abs=0.05)

@@ -8,6 +8,7 @@ import numpy as np
 
 from vinemap.canopy.points import NO_SECTIONS, canopy_floor, canopy_size
 from vinemap.compute.compiled import compiled
+from vinemap.compute.order import quantile
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ TALL = 0.1
 UPPER = 0.5
 """Share of a row's height from which points are high."""
 STICKING, THIN = 1.3, 0.1
-"""Height, in the row's own, from which points that spread no more than so many metres across it are a post's."""
+"""Height, in the row's own, from which points are a post's if half of them lie within so many metres across the row."""
 GROUND = 0.3
 """Metres above or below the terrain model within which points tell the inter-row's elevation."""
 
@@ -162,12 +163,19 @@ def _separate(
 
 @compiled
 def _is_post(y: Values, up: Values, canopy: Flags, low: float) -> bool:
-    """Whether what stands above some height is thin."""
-    n, total, squares = 0, 0.0, 0.0
+    """Whether what stands above some height is thin; strays beside it don't make it wide."""
+    above = np.empty(len(y))
+    n = 0
     for p in range(len(y)):
         if canopy[p] and up[p] > low:
-            n, total, squares = n + 1, total + y[p], squares + y[p] ** 2
-    return n > 0 and squares / n - (total / n) ** 2 <= THIN**2
+            above[n] = y[p]
+            n += 1
+    if n == 0:
+        return False
+    middle = quantile(above, 0, n, 0.5)
+    for i in range(n):
+        above[i] = abs(above[i] - middle)
+    return quantile(above, 0, n, 0.5) <= THIN
 
 
 @compiled
