@@ -164,18 +164,18 @@ def _separate(
 @compiled
 def _is_post(y: Values, up: Values, canopy: Flags, low: float) -> bool:
     """Whether what stands above some height is thin; strays beside it don't make it wide."""
-    above = np.empty(len(y))
-    n = 0
+    above, first = np.empty(len(y)), 0 * len(y)  # a plain 0 would have `quantile` compiled twice
+    n = first
     for p in range(len(y)):
         if canopy[p] and up[p] > low:
             above[n] = y[p]
             n += 1
     if n == 0:
         return False
-    middle = quantile(above, 0, n, 0.5)
+    middle = quantile(above, first, n, 0.5)
     for i in range(n):
         above[i] = abs(above[i] - middle)
-    return quantile(above, 0, n, 0.5) <= THIN
+    return quantile(above, first, n, 0.5) <= THIN
 
 
 @compiled

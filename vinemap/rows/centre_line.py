@@ -93,7 +93,7 @@ def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Valu
             robust[i] = weight[i]
         before = centre
         for _ in range(3):
-            centre, held = _smoothed(measured, robust, cutoff), 0
+            centre, held = _smoothed(measured, robust, cutoff), first
             for i in range(n):
                 if weight[i] > 0:
                     ranked[held] = abs(measured[i] - centre[i])
