@@ -10,12 +10,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.rows.joins import candidates, ends_of, join, torn
+from vinemap.rows.joins import KINK, SHORT, STRIDE, TANGENT_LENGTH, candidates, ends_of, join
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -26,6 +28,10 @@ if TYPE_CHECKING:
 
 ALIGNED = 0.87
 """Cosine of the angle between two key points' rows up to which they may belong to one."""
+SHARP = np.radians(20)
+"""Radians of a kink that no row has, whatever those beside it do."""
+BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
+"""Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 
 
 def cluster_rows(
@@ -79,7 +85,7 @@ def cluster_rows(
     if thesis:
         return out.assign(cluster=pieces)
     position = _position_along(np.flatnonzero(kept), pieces, graph)
-    pieces, position = torn(xy[kept], spacing[kept], pieces, position)
+    pieces, position = _torn(xy[kept], spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
     rows = join(ends, candidates(ends, max_gap), xy[kept], track_width=track_width, cover=cover)
     return out.assign(cluster=rows[pieces])
@@ -179,3 +185,61 @@ def _position_along(points: Ints, pieces: Ints, graph: csr_array) -> Values:
     order = np.lexsort((way, pieces))
     last = np.searchsorted(pieces[order], np.arange(pieces.max() + 1), side="right") - 1
     return way_from(order[last])
+
+
+def _torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
+    """Pieces (n,) of key points (n, 2) and their places along them, torn at kinks where more rows end than go on.
+
+    There two blocks abut, at a track that narrows to nothing, and rows of both touch. No row has a ``SHARP`` kink.
+    """
+    pieces, position = pieces.copy(), position.copy()
+    order = np.argsort(pieces, kind="stable")
+    first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
+    tree = None
+    for p in np.flatnonzero(np.diff(first)):
+        members = order[first[p] : first[p + 1]]
+        for s, turn in reversed(_kinks(xy[members], position[members])):
+            tree = tree or cKDTree(xy)
+            middle, before, after = (
+                xy[members[np.abs(position[members] - at).argmin()]]
+                for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
+            )
+            if turn > SHARP or _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
+                beyond = members[position[members] > s]
+                pieces[beyond] = pieces.max() + 1
+                position[beyond] -= position[beyond].min()
+                members = members[position[members] <= s]
+    return pieces, position
+
+
+def _kinks(xy: Values, position: Values) -> Values:
+    """Metres along a piece (n, 2) at which it turns more than it bends before and after, and radians more (k, 2)."""
+    k, least = round(TANGENT_LENGTH / STRIDE), round(SHORT / STRIDE)
+    order = np.argsort(position)
+    along = np.arange(0, position[order[-1]], STRIDE)
+    if len(along) <= 2 * least:
+        return np.empty((0, 2))
+    curve = np.column_stack([np.interp(along, position[order], xy[order, axis]) for axis in (0, 1)])
+    here = np.arange(least, len(along) - least)
+    before, after = (
+        curve[here] - curve[np.maximum(here - k, 0)],
+        curve[np.minimum(here + k, len(along) - 1)] - curve[here],
+    )
+    turn = np.zeros(len(along))
+    turn[here] = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
+    padded = np.pad(turn, k)
+    sides = np.stack([padded[: -2 * k], padded[2 * k :]])
+    bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
+    # Beside a kink it is a bend, and what is straight there no kink.
+    kink = np.minimum(np.abs(turn), np.abs(turn - bend))
+    out: Values = np.column_stack([along, kink])[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
+    return out
+
+
+def _end_beside(tree: cKDTree, pieces: Ints, middle: Values, along: Values, spacing: float) -> bool:
+    """Whether more of the rows beside a kink end there than go on through it."""
+    near = np.array(tree.query_ball_point(middle, np.hypot(STRETCH, BESIDE * spacing)))
+    x = (tree.data[near] - middle) @ along / np.hypot(*along)
+    before, after = (set(pieces[near[(way * x >= ASLANT) & (way * x <= STRETCH)]]) for way in (-1, 1))
+    # The row itself goes on; a row that ends here and another that begins count as one.
+    return len(before ^ after) > 2 * (len(before & after) - 1)

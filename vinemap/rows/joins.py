@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
@@ -27,8 +26,6 @@ SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 STRIDE = 0.5
 """Metres between the places of a piece at which it is asked whether it turns."""
-BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
-"""Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -46,31 +43,6 @@ class Ends(NamedTuple):
     spacing: Values
     bend: Values
     """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
-
-
-def torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
-    """Pieces (n,) of key points (n, 2) and their places along them, torn at kinks where more rows end than go on.
-
-    There two blocks abut, at a track that narrows to nothing, and rows of both touch.
-    """
-    pieces, position = pieces.copy(), position.copy()
-    order = np.argsort(pieces, kind="stable")
-    first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
-    tree = None
-    for p in np.flatnonzero(np.diff(first)):
-        members = order[first[p] : first[p + 1]]
-        for s in reversed(_kinks(xy[members], position[members])):
-            tree = tree or cKDTree(xy)
-            middle, before, after = (
-                xy[members[np.abs(position[members] - at).argmin()]]
-                for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
-            )
-            if _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
-                beyond = members[position[members] > s]
-                pieces[beyond] = pieces.max() + 1
-                position[beyond] -= position[beyond].min()
-                members = members[position[members] <= s]
-    return pieces, position
 
 
 def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, position: Values) -> Ends:
@@ -189,36 +161,3 @@ def _bends(ends: Ends) -> Values:
     told = np.isfinite(distance).all(axis=1)
     out[told] = np.median(sense * ends.bend[near], axis=1)[told]
     return out
-
-
-def _kinks(xy: Values, position: Values) -> Values:
-    """Metres along a piece (n, 2) at which it turns more than it bends before and after."""
-    k, least = round(TANGENT_LENGTH / STRIDE), round(SHORT / STRIDE)
-    order = np.argsort(position)
-    along = np.arange(0, position[order[-1]], STRIDE)
-    if len(along) <= 2 * least:
-        return np.empty(0)
-    curve = np.column_stack([np.interp(along, position[order], xy[order, axis]) for axis in (0, 1)])
-    here = np.arange(least, len(along) - least)
-    before, after = (
-        curve[here] - curve[np.maximum(here - k, 0)],
-        curve[np.minimum(here + k, len(along) - 1)] - curve[here],
-    )
-    turn = np.zeros(len(along))
-    turn[here] = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
-    padded = np.pad(turn, k)
-    sides = np.stack([padded[: -2 * k], padded[2 * k :]])
-    bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
-    # Beside a kink it is a bend, and what is straight there no kink.
-    kink = np.minimum(np.abs(turn), np.abs(turn - bend))
-    out: Values = along[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
-    return out
-
-
-def _end_beside(tree: cKDTree, pieces: Ints, middle: Values, along: Values, spacing: float) -> bool:
-    """Whether more of the rows beside a kink end there than go on through it."""
-    near = np.array(tree.query_ball_point(middle, np.hypot(STRETCH, BESIDE * spacing)))
-    x = (tree.data[near] - middle) @ along / np.hypot(*along)
-    before, after = (set(pieces[near[(way * x >= ASLANT) & (way * x <= STRETCH)]]) for way in (-1, 1))
-    # The row itself goes on; a row that ends here and another that begins count as one.
-    return len(before ^ after) > 2 * (len(before & after) - 1)
