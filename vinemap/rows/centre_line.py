@@ -10,7 +10,7 @@ from scipy.ndimage import shift
 from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import CARRIED_ON, blurred_down
 from vinemap.compute.order import quantile
-from vinemap.geo.curve import normals
+from vinemap.geo.curve import normals, resample, smoothed
 from vinemap.geo.raster import sample, sample_across
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ SETTLED = 2e-4
 """Metres by which a centre line moves at the most when it is found."""
 ABREAST = 0.48
 """Share of the spacing, at the most, that lies to both sides of a row and is its own."""
+COURSE = 20.0
+"""Wavelength in metres below which a course's bends are not trusted."""
 EDGE, ROOM = 0.2, 1.75
 """Share of a row's cover at which its canopy ends across it, and how many times that far its points are taken."""
 CELL = 0.05
@@ -234,6 +236,11 @@ def runs_above(profile: Values, level: float) -> Values:
     end = fall - 1 + (padded[fall] - level) / (padded[fall] - padded[fall + 1])
     out: Values = np.clip(np.column_stack([start, end]), 0, len(profile) - 1)
     return out
+
+
+def smooth_course(course: Values, *, beyond: float) -> Values:
+    """Course without the bends that the centre line is to find, carried on beyond its ends."""
+    return resample(smoothed(course, wavelength=COURSE, beyond=beyond, step=5 * CELL), CELL)
 
 
 def half_width(spacing: Values | float) -> Values:

@@ -11,12 +11,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from vinemap.geo.curve import between, extend, resample, way_along
 from vinemap.geo.raster import sample
-from vinemap.rows.centre_line import CELL, runs_above
+from vinemap.rows.centre_line import CELL, EDGE, runs_above
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from vinemap.compute.arrays import Values
+    from vinemap.compute.arrays import Flags, Values
     from vinemap.geo.raster import Raster
     from vinemap.surfaces.seen import Seen
 
@@ -31,6 +31,8 @@ CORE, NARROW = 0.5, 0.5
 """Share of a canopy's half width, and metres to both sides at the least, within which it tells where it ends."""
 SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
+OWN = 0.3
+"""Share of a canopy across that must lie outside of another row's for it to tell where it ends."""
 NEAR, SPREAD = 0.25, 4.0
 """Metres, and times that known ends are off in the median, by which one may be."""
 ACROSS = 0.5
@@ -47,7 +49,8 @@ class Standing(NamedTuple):
 
     ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it. Before
     a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle. ``told`` says of either
-    end whether canopy tells it, as it does unless the end is known and nothing ends near it.
+    end whether canopy tells it, as it does unless the end is known and nothing ends near it. ``half`` is the canopy's
+    half width in metres, at half its cover and at the ``EDGE`` of it.
     """
 
     curve: Values
@@ -56,6 +59,7 @@ class Standing(NamedTuple):
     goes_on: tuple[bool, bool] = (False, False)
     sides: Values = NOTHING
     told: tuple[bool, bool] = (True, True)
+    half: tuple[float, float] = (0.0, 0.0)
 
     @property
     def length(self) -> float:
@@ -83,14 +87,24 @@ class Known(NamedTuple):
 
 
 def find_canopy(
-    curve: Values, image: Values, ridge: Values, end_share: float, *, least: float = 0.0
+    curve: Values,
+    image: Values,
+    ridge: Values,
+    end_share: float,
+    *,
+    least: float = 0.0,
+    theirs: Flags | None = None,
 ) -> Standing | None:
     """Find the canopy along a curve; None where there is none.
 
     Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out. From so many
-    metres of full cover across on there may be canopy.
+    metres of full cover across on there may be canopy. What stands in cells that are other rows' is theirs.
     """
-    profile = _core(image).sum(axis=1) * CELL
+    across = image.mean(axis=0)
+    core = _core(across)
+    profile = image[:, core].sum(axis=1) * CELL
+    if theirs is not None and theirs.any():
+        profile = _own(image[:, core], ~theirs[:, core])
     present = profile[profile > max(0.3 * np.quantile(profile, 0.95), least)]
     if len(present) == 0:
         return None
@@ -107,7 +121,21 @@ def find_canopy(
         return None
     sides = np.array([_sides(ridge[int(a) : int(b) + 1]) for a, b in np.array(runs)[long]])
     contrast = float(np.clip(1 - _sides(ridge[profile > edge]), 0, 1))
-    return Standing(curve, metres[long], contrast, sides=sides)
+    return Standing(curve, metres[long], contrast, sides=sides, half=(_half(across, 0.5), _half(across, EDGE)))
+
+
+def _half(across: Values, share: float) -> float:
+    """Half of the metres across a row on which it has such a share of its most cover (cells,)."""
+    return 0.5 * CELL * np.count_nonzero(across >= share * across.max())
+
+
+def _own(image: Values, own: Flags) -> Values:
+    """Metres of cover (stations,) across a row, as far as the cells that are its own tell it."""
+    alone = own.all(axis=1)
+    across = image[alone if alone.any() else slice(None)].mean(axis=0)
+    share = (own * across).sum(axis=1) / across.sum()
+    out: Values = np.where(share >= OWN, (own * image).sum(axis=1) * CELL / np.maximum(share, OWN), 0.0)
+    return out
 
 
 def thereabouts(profile: Values, typical: float, *, around: float) -> Values:
@@ -128,14 +156,16 @@ def _sides(image: Values) -> float:
     return beside / ridge if ridge else 1.0
 
 
-def cut_to_canopy(curve: Values, image: Values, ridge: Values, end_share: float) -> Standing | None:
+def cut_to_canopy(
+    curve: Values, image: Values, ridge: Values, end_share: float, *, theirs: Flags | None = None
+) -> Standing | None:
     """Cut a curve to where its canopy begins and ends, as of :func:`find_canopy`; None where there is none."""
-    row = find_canopy(curve, image, ridge, end_share)
+    row = find_canopy(curve, image, ridge, end_share, theirs=theirs)
     if row is None:
         return None
     first, last = row.runs[0, 0], row.runs[-1, 1]
     goes_on = bool(first < USUAL), bool(last > way_along(curve)[-1] - USUAL)
-    return Standing(between(curve, first, last), row.runs - first, row.contrast, goes_on)
+    return Standing(between(curve, first, last), row.runs - first, row.contrast, goes_on, half=row.half)
 
 
 def cut_as_known(rows: Sequence[Standing], known: Sequence[Known]) -> list[Standing]:
@@ -177,17 +207,16 @@ def _end_near(runs: Values, sides: Values, known: float, whole: float, slack: fl
     return float(runs[own[-1], 1]) if len(own) else np.nan
 
 
-def _core(image: Values) -> Values:
-    """Middle of a straightened row (stations, cells across): wide canopies end round, there last.
+def _core(across: Values) -> slice:
+    """Cells of the middle of a row, of whose cover (cells,) across it: wide canopies end round, there last.
 
     All of it, where the row is narrow or its middle hollow.
     """
-    across, middle = image.mean(axis=0), image.shape[1] // 2
+    middle = len(across) // 2
     if across[middle] < 0.5 * across.max():
-        return image
-    half = 0.5 * CELL * np.count_nonzero(across >= 0.5 * across.max())
-    reach = round(max(CORE * half, NARROW) / CELL)
-    return image[:, max(middle - reach, 0) : middle + reach + 1]
+        return slice(None)
+    reach = round(max(CORE * _half(across, 0.5), NARROW) / CELL)
+    return slice(max(middle - reach, 0), middle + reach + 1)
 
 
 def lay_out(

@@ -18,10 +18,11 @@ from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import blurred
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import between, extend, normals, resample, smoothed, way_along
+from vinemap.geo.curve import between, extend, normals, resample, way_along
 from vinemap.geo.raster import Raster, cells_in, nearest_cell
-from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths
+from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
+from vinemap.rows.joins import part_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -41,8 +42,6 @@ MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
 FARTHER = 4
 """Times that it is looked for as far again, where it hasn't ended."""
-COURSE = 20.0
-"""Wavelength in metres below which a course's bends are not trusted."""
 POINTS_A_METRE = 200.0
 """Canopy points in a metre of row for which the smoothing is meant."""
 RAMP = 0.1
@@ -127,9 +126,18 @@ def fit_rows(
         if not unended:
             break
         members = np.array(list(unended))
-        curves = [_smooth_course(curve) for curve in unended.values()]
+        curves = [smooth_course(curve, beyond=MARGIN) for curve in unended.values()]
     if settled := [of for _, of in looked_at if of]:
         fits = dict(enumerate(cut_as_known([row for _, row in sorted(fits.items()) if row], settled)))
+    else:
+        rows = {k: fit for k, fit in sorted(fits.items()) if fit}
+        spacing = courses["spacing_m"].to_numpy()[list(rows)]
+        for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing, cover, margin=MARGIN).items():
+            k, these = list(rows)[n], [course, *beside]
+            like = np.full(len(these), k)
+            dealt = _deal(cloud, vines, levels, these, half[like], curtains[like], [None] * len(these), high)
+            share = next(share for group, shares in dealt for m, share in zip(group, shares, strict=True) if m == 0)
+            fits[k] = _fit(share, theirs=theirs, smoothing=smoothing, end_share=end_share) or fits[k]
     standing = [
         (spacing, fit)
         for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True))
@@ -138,8 +146,10 @@ def fit_rows(
     return lay_out(standing, seen, dtm, within=within, min_gap=min_gap)
 
 
-def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | None:
-    """Centre line of a row about its course, between the ends of its canopy."""
+def _fit(
+    share: _Share, *, smoothing: float, end_share: float, theirs: shapely.Geometry | None = None
+) -> Standing | None:
+    """Centre line of a row about its course, between the ends of its canopy, which others' isn't."""
     still, known = np.zeros(len(share.curve)), share.known
     if known and len(share.station) == 0:
         return Standing(share.curve, np.empty((0, 2)), 0.0)
@@ -151,6 +161,8 @@ def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | Non
     reach = _reach(image, offsets, share.half)
     shift: Values = still
     if known is None or known.moves:
+        if theirs:
+            image = np.where(_within(theirs, share.curve, offsets).any(axis=1, keepdims=True), 0.0, image)
         shift = centre_line(image, offsets, reach=reach, cutoff=cutoff, curtains=share.curtains)
     if known and len(canopy := np.flatnonzero(image.sum(axis=1) * CELL > known.least)):
         shift = shift[np.clip(np.arange(len(shift)), canopy[0], canopy[-1])]
@@ -159,9 +171,18 @@ def _fit(share: _Share, *, smoothing: float, end_share: float) -> Standing | Non
     if share.ridge is not share.body:
         ridge = _straighten(share, share.ridge, shift)[0]
     if known is None:
-        return cut_to_canopy(centred, body, ridge, end_share)
+        cells = _within(theirs, centred, offsets) if theirs else None
+        return cut_to_canopy(centred, body, ridge, end_share, theirs=cells)
     row = find_canopy(centred, body, ridge, end_share, least=known.least)
     return row or Standing(centred, np.empty((0, 2)), 0.0)
+
+
+def _within(canopies: shapely.Geometry, curve: Values, offsets: Values) -> Flags:
+    """Cells (stations, cells across) of a row straightened along a curve that lie in canopies."""
+    shapely.prepare(canopies)
+    cells = curve[:, None] + offsets[:, None] * normals(curve, smoothing=1 / CELL)[:, None]
+    out: Flags = shapely.contains_xy(canopies, cells[..., 0], cells[..., 1])
+    return out
 
 
 def _unended(fits: dict[int, Standing | None], half: Values) -> dict[int, Values]:
@@ -208,17 +229,12 @@ def _looked_at(course: dict[str, Any]) -> tuple[Values, Known | None]:
     """The curve along which a row's canopy is looked for, and what is known of the row."""
     xy = shapely.get_coordinates(course["geometry"])
     if "moves" not in course:
-        return _smooth_course(xy), None
+        return smooth_course(xy, beyond=MARGIN), None
     before, after = course["before_m"], course["after_m"]
     beyond = float(np.ceil(max(before, after) / MARGIN)) * MARGIN
-    curve = _smooth_course(xy, beyond=beyond) if course["moves"] else extend(xy, beyond)
+    curve = smooth_course(xy, beyond=beyond) if course["moves"] else extend(xy, beyond)
     curve = resample(between(curve, beyond - before, way_along(curve)[-1] - beyond + after), CELL)
     return curve, Known(before, way_along(curve)[-1] - after, course["slack_m"], course["moves"], course["least_m"])
-
-
-def _smooth_course(course: Values, *, beyond: float = MARGIN) -> Values:
-    """Course without the bends that the centre line is to find, carried on beyond its ends."""
-    return resample(smoothed(course, wavelength=COURSE, beyond=beyond, step=5 * CELL), CELL)
 
 
 def _deal(
