@@ -40,6 +40,8 @@ def drive_flow(drive: str, config: DrivesConfig, camera: Camera) -> DriveSummary
         camera=camera,
         start=own.start,
         rows=config.rows if own.start else None,
+        motion=own.motion,
+        places=own.fixes,
         template_share=options.template_share,
         angles=(-options.turn_deg, options.turn_deg),
         method=options.method,

@@ -45,6 +45,8 @@ class DriveConfig(Options):
 
     frames: list[Path] = Field(min_length=1, description="images, folders of images, or videos, in order")
     start: MapStart | None = Field(None, description="latitude, longitude, heading clockwise from north (degrees)")
+    motion: Path | None = Field(None, description="CSV of wheel speeds or yaw rates")
+    fixes: Path | None = Field(None, description="CSV of satellite fixes; they want a start")
 
 
 class DrivesConfig(Options):
