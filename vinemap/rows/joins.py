@@ -250,25 +250,27 @@ def _tips(rows: Sequence[Standing], lines: Values, spacing: Values) -> dict[tupl
     half = np.array([row.half[1] for row in rows])
     tree, widest = shapely.STRtree(lines), 2 * float(half.max(initial=0.0))
 
-    def touched(k: int, xy: Values) -> tuple[Ints, Ints]:
+    def touched(row: Ints, xy: Values) -> tuple[Ints, Ints]:
+        """Which places (n, 2) of rows (n,) lie in canopies of others, and in whose."""
         here, other = tree.query(shapely.points(xy), predicate="dwithin", distance=widest)
-        near = np.minimum(half[k] + half[other], NEAR * np.minimum(spacing[k], spacing[other]))
-        held = (other != k) & (shapely.distance(shapely.points(xy[here]), lines[other]) < near)
+        own = row[here]
+        near = np.minimum(half[own] + half[other], NEAR * np.minimum(spacing[own], spacing[other]))
+        held = (other != own) & (shapely.distance(shapely.points(xy[here]), lines[other]) < near)
         return here[held], other[held]
 
+    tips = [(k, end) for k in range(len(rows)) for end in ENDS]
+    places = np.array([rows[k].curve[-1 if end else 0] for k, end in tips]).reshape(-1, 2)
     out = {}
-    for k, row in enumerate(rows):
-        for end in ENDS:
-            curve = row.curve[::-1] if end else row.curve
-            if not len(touched(k, curve[:1])[0]):
-                continue
-            stations = np.arange(0, row.length, CELL)
-            here, others = touched(k, at(curve, stations))
-            held = np.isin(np.arange(len(stations)), here)
-            n = round(NEAR * spacing[k] / CELL)
-            free = ~sliding_window_view(held, n).any(axis=1) if len(held) > n else np.zeros(1, dtype=bool)
-            first = int(free.argmax()) if free.any() else len(stations)
-            out[k, end] = _Tip((first + n) * CELL, np.unique(others[here < first]))
+    for tip in np.unique(touched(np.repeat(np.arange(len(rows)), 2), places)[0]):
+        k, end = tips[tip]
+        stations = np.arange(0, rows[k].length, CELL)
+        curve = rows[k].curve[::-1] if end else rows[k].curve
+        here, others = touched(np.full(len(stations), k), at(curve, stations))
+        held = np.isin(np.arange(len(stations)), here)
+        n = round(NEAR * spacing[k] / CELL)
+        free = ~sliding_window_view(held, n).any(axis=1) if len(held) > n else np.zeros(1, dtype=bool)
+        first = int(free.argmax()) if free.any() else len(stations)
+        out[k, end] = _Tip((first + n) * CELL, np.unique(others[here < first]))
     return out
 
 
