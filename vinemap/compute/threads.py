@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections import deque
@@ -21,6 +22,8 @@ T = TypeVar("T")
 
 FEW = 16
 """Items that one core has done before another would have begun."""
+CACHED = 200_000
+"""Cells, about, of which a core's cache holds what is worked out for them."""
 _here = threading.local()
 
 
@@ -89,8 +92,17 @@ def ahead(items: Iterator[T]) -> Iterator[Iterator[T]]:
         yield following()
 
 
-def stretches(n: int) -> list[tuple[int, int]]:
-    """Stretches of n items, one a core but for few items, as first and last + 1."""
-    parts = machine.cores() if n >= FEW else 1
+def stretches(n: int, most: float = math.inf) -> list[tuple[int, int]]:
+    """Stretches of n items, one a core but for few items, or more, of so many at the most: first and last + 1."""
+    parts = max(machine.cores() if n >= FEW else 1, math.ceil(n / most))
     bounds = [n * k // parts for k in range(parts + 1)]
     return list(pairwise(bounds))
+
+
+def strips(shape: tuple[int, int], *, beside: int) -> list[tuple[int, int]]:
+    """Strips of a raster's rows (ny, nx) that are worked one by one, by so many rows beside them: first and last + 1.
+
+    A core's cache holds one, and what lies beside it is little of it.
+    """
+    ny, nx = shape
+    return stretches(ny, max(CACHED / nx, 8 * beside))

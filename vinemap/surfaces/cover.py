@@ -16,7 +16,7 @@ from scipy.ndimage import (
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import distance_to
-from vinemap.compute.threads import in_threads
+from vinemap.compute.threads import in_threads, strips
 from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
 from vinemap.surfaces.statistics import LOWEST, height_about
 
@@ -138,13 +138,27 @@ def canopy_cover(
         blocks[1] = block_sum(canopy, k)
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
-    cover, blurred = in_threads(lambda layer: gaussian_filter(layer, sigma, output=np.float32), [canopy, everything])
-    cover /= blurred + np.float32(0.1 * density)
+    cover = _share(canopy, everything, sigma, 0.1 * density)
     no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side, about).repeat(k, axis=0).repeat(k, axis=1)
     cover[no_vines[: grid.ny, : grid.nx]] = 0.0
     if roofs.any():
         cover[_grown(roofs, MARGIN, chm.grid.resolution).ravel()[cells_in(chm.grid, grid)]] = 0.0
     return Raster(cover, grid, cloud.crs), levels
+
+
+def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Values:
+    """Points (ny, nx) of canopy by all points and so many more, both blurred by a Gaussian of sigma cells."""
+    reach, cover = int(4 * sigma + 0.5), np.empty(canopy.shape, dtype=np.float32)
+
+    def share(rows: tuple[int, int]) -> None:
+        first, last = rows
+        around = slice(max(first - reach, 0), last + reach)
+        some, of_all = (gaussian_filter(layer[around], sigma, output=np.float32) for layer in (canopy, everything))
+        inner = slice(first - around.start, last - around.start)
+        np.divide(some[inner], of_all[inner] + np.float32(more), out=cover[first:last])
+
+    in_threads(share, strips(canopy.shape, beside=reach))
+    return cover
 
 
 def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Grid, resolution: float) -> Flags:

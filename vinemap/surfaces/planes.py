@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from vinemap.compute.threads import in_threads
+from vinemap.compute.threads import in_threads, strips
 from vinemap.geo.raster import block_sum
 
 if TYPE_CHECKING:
@@ -69,17 +69,21 @@ def _plane_fit(level: Floats, weight: Floats, sigma: float) -> Floats:
     bell /= bell.sum()
     kernels = bell, bell * t, bell * t**2
 
-    values = weight * level
-    wanted = [(weight, 0, 0), (weight, 1, 0), (weight, 0, 1), (weight, 2, 0), (weight, 1, 1), (weight, 0, 2)]
-    wanted += [(values, 0, 0), (values, 1, 0), (values, 0, 1)]
-
-    def moment(of: tuple[Floats, int, int]) -> Floats:
-        down: Floats = correlate1d(of[0], kernels[of[1]], axis=0, mode="constant")
-        out: Floats = correlate1d(down, kernels[of[2]], axis=1, mode="constant")
+    def moment(of: Floats, i: int, j: int) -> Floats:
+        down: Floats = correlate1d(of, kernels[i], axis=0, mode="constant")
+        out: Floats = correlate1d(down, kernels[j], axis=1, mode="constant")
         return out
 
-    w, wi, wj, wii, wij, wjj, z, zi, zj = in_threads(moment, wanted)
-    w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
-    # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
-    a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj
-    return (a * z + b * zi + c * zj) / (a * w + b * wi + c * wj)
+    def fitted(rows: tuple[int, int]) -> Floats:
+        around = slice(max(rows[0] - radius, 0), rows[1] + radius)
+        weights = weight[around]
+        values = weights * level[around]
+        w, wi, wj, wii, wij, wjj = (moment(weights, *ij) for ij in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)))
+        z, zi, zj = (moment(values, *ij) for ij in ((0, 0), (1, 0), (0, 1)))
+        w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
+        # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
+        a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj
+        out: Floats = (a * z + b * zi + c * zj) / (a * w + b * wi + c * wj)
+        return out[rows[0] - around.start :][: rows[1] - rows[0]]
+
+    return np.concatenate(in_threads(fitted, strips(level.shape, beside=radius)))
