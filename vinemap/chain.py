@@ -132,6 +132,7 @@ def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Cal
     settings = settings or Settings()
     cut = found.cloud, found.rows, found.gaps, found.dtm
     canopies = step("Sections", find_canopies, *cut, settings)
+    found.cloud.forget()
     options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
     model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
     machine.give_back()

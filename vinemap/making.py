@@ -14,6 +14,7 @@ from vinemap.canopy.numbers import as_seen, judge_canopies, summarise_rows
 from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.tiles import moved
 from vinemap.cloud.write import write_classified
+from vinemap.compute import machine
 from vinemap.compute.threads import aside
 from vinemap.evaluate.meshes import measure_meshes
 from vinemap.evaluate.trunks import vines_in_rows
@@ -82,6 +83,8 @@ def make_product(
         given = settings.missing.model_dump() | {"step": apart, "known": standing}
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
         rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
+        del model  # much memory, that what follows doesn't need
+        machine.give_back()
         outlines = parcel_layer(parcel, rows, polygon, points)
         layers = {
             "rows": rows,
@@ -98,7 +101,7 @@ def make_product(
         record = record_of(recipe, found.cloud, layers, surfaces, **about)
 
         cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
-        del found, model  # much memory, that writing needs
+        del found
 
         def write() -> list[str]:
             how = settings.product.model_dump(include={"plain", "geoid", "audit"})

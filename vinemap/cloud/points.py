@@ -74,6 +74,10 @@ class PointCloud:
         """The points sorted into cells, where they were before."""
         return self._kept.get("bins")
 
+    def forget(self) -> None:
+        """Let go of the cells, where nothing more is asked of them."""
+        self._kept.pop("bins", None)
+
     def above(self, dtm: Raster, ceiling: Raster | None = None) -> PointCloud:
         """The cloud with its heights above a terrain model; what is higher than a ceiling is ``HIDDEN``."""
         heights = above(dtm, self.xyz)

@@ -82,6 +82,9 @@ class TiledCloud:
                 part = PointCloud(xyz, self.crs, self.vertical, first=tile.first, classification=classes)
                 yield part.above(self.dtm, self.ceiling) if self.dtm else part
 
+    def forget(self) -> None:
+        """Nothing is kept of the cells."""
+
     def above(self, dtm: Raster, ceiling: Raster | None = None) -> TiledCloud:
         """The cloud with its heights above a terrain model; what is higher than a ceiling is hidden."""
         return replace(self, dtm=dtm, ceiling=ceiling)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from vinemap.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pyproj import CRS
+
+S = TypeVar("S", bound=np.generic)
 
 MAX_CELLS = 80_000_000
 """Cells of the finest raster, 0.8 km² at 0.1 m."""
@@ -132,11 +134,22 @@ def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int32]:
 
 def cells_in(coarse: Grid, fine: Grid) -> NDArray[np.int64]:
     """Index (ny, nx) of the coarse cell in which each fine one lies."""
+    i, j = _lines_in(coarse, fine)
+    out: NDArray[np.int64] = i[:, None] * coarse.nx + j
+    return out
+
+
+def spread(values: NDArray[S], coarse: Grid, fine: Grid) -> NDArray[S]:
+    """Values of coarse cells at the fine ones (ny, nx) that lie in them."""
+    return values[np.ix_(*_lines_in(coarse, fine))]
+
+
+def _lines_in(coarse: Grid, fine: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (ny,) and columns (nx,) of a coarse raster in which those of a fine one lie."""
     x, y = fine.centres()
     i = np.clip(((coarse.north - y) / coarse.resolution).astype(int), 0, coarse.ny - 1)
     j = np.clip(((x - coarse.west) / coarse.resolution).astype(int), 0, coarse.nx - 1)
-    out: NDArray[np.int64] = i[:, None] * coarse.nx + j
-    return out
+    return i, j
 
 
 def block_sum(values: NDArray[np.floating] | NDArray[np.integer], k: int) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import blurred
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import between, extend, normals, resample, way_along
-from vinemap.geo.raster import Raster, cells_in, nearest_cell
+from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
 from vinemap.rows.joins import part_rows
@@ -221,7 +221,7 @@ def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags
     touching = levels.touching
     if touching.any() and len(half):
         wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
-        vines |= wider & touching.ravel()[cells_in(levels.body.grid, cover.grid)]
+        vines |= wider & spread(touching, levels.body.grid, cover.grid)
     return vines, cover.grid
 
 

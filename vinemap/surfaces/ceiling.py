@@ -21,7 +21,7 @@ from scipy.ndimage import (
 )
 
 from vinemap.compute.filters import distance_to
-from vinemap.geo.raster import Raster, cells_in, coarser
+from vinemap.geo.raster import Raster, coarser, spread
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.statistics import LOWEST, height_about
 
@@ -114,7 +114,7 @@ def _nets(chm: Raster) -> Values:
 
 def _in_cells(heights: Values, grid: Grid) -> Values:
     """What :func:`vinemap.surfaces.statistics.height_about` gives, in the cells (ny, nx) of the height model."""
-    out: Values = heights.ravel()[cells_in(coarser(grid, resolution=1.0), grid)]
+    out: Values = spread(heights, coarser(grid, resolution=1.0), grid)
     return out
 
 

@@ -17,7 +17,7 @@ from scipy.ndimage import (
 from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import distance_to
 from vinemap.compute.threads import in_threads, strips
-from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell
+from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell, spread
 from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def canopy_cover(
     counts = _counts(cloud, grid, metres, (foot, ridge), high)
     everything, body, crown, _ = counts
     k, side = _cells_a_block(resolution), _side(resolution)
-    blocks = [block_sum(layer, k) for layer in counts]
+    blocks = [block_sum(layer, k).astype(np.float32) for layer in counts]
     touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
     if touching.any():
         touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
@@ -128,21 +128,21 @@ def canopy_cover(
     about = _about(rows, squares)
     roofs = _roofs(chm, everything, body, grid, high)
     if about.any():
-        roofs &= ~about.ravel()[cells_in(squares, chm.grid)]
+        roofs &= ~spread(about, squares, chm.grid)
     apart = _apart(touching, body, crown, grid, metres, resolution)
     apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = body
     if apart.any():
-        canopy = np.where(apart.ravel()[cells_in(metres, grid)], crown, body)
-        blocks[1] = block_sum(canopy, k)
+        canopy = np.where(spread(apart, metres, grid), crown, body)
+        blocks[1] = block_sum(canopy, k).astype(np.float32)
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover = _share(canopy, everything, sigma, 0.1 * density)
     no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side, about).repeat(k, axis=0).repeat(k, axis=1)
     cover[no_vines[: grid.ny, : grid.nx]] = 0.0
     if roofs.any():
-        cover[_grown(roofs, MARGIN, chm.grid.resolution).ravel()[cells_in(chm.grid, grid)]] = 0.0
+        cover[spread(_grown(roofs, MARGIN, chm.grid.resolution), chm.grid, grid)] = 0.0
     return Raster(cover, grid, cloud.crs), levels
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from vinemap.cloud.bins import quantiles_in
-from vinemap.geo.raster import Grid, Raster, above, cells_in, coarser, window
+from vinemap.geo.raster import Grid, Raster, above, coarser, spread, window
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
@@ -63,5 +63,5 @@ def height_about(chm: Raster, high: float, *, order: float = TOP) -> Values:
     rank = np.maximum(np.ceil(order * n).astype(int) - 1, 0)
     top = np.nan_to_num(np.take_along_axis(ordered, rank[:, :, None], axis=2)[:, :, 0])
     coarse = Grid(chm.grid.west, chm.grid.north, squares * chm.grid.resolution, ny, nx)
-    out: Values = maximum_filter(top, 3).ravel()[cells_in(coarse, coarser(chm.grid, resolution=1.0))]
+    out: Values = spread(maximum_filter(top, 3), coarse, coarser(chm.grid, resolution=1.0))
     return out
