@@ -53,6 +53,40 @@ def test_a_patch_that_goes_its_own_way_does_not_agree():
     assert not some.fit
 
 
+def over_relief(seed):
+    """Patches that rolling ground puts aside, along the movement, neighbours alike."""
+    some = patches((0.4, -0.2), 0.002, noise=0.02, seed=seed)
+    hills = np.random.default_rng(seed).normal(0, 1.5, (6, 6))
+    heights = (hills[1:, 1:] + hills[1:, :-1] + hills[:-1, 1:] + hills[:-1, :-1]).ravel() / 2
+    way = np.array([PLACE.column - CENTRE[1], PLACE.row - CENTRE[0]])
+    return some._replace(shifts=some.shifts + heights[:, None] * way / np.hypot(*way))
+
+
+def test_relief_says_nothing_across_the_movement_and_spoils_no_turn():
+    fits = [fit_of(over_relief(seed), PLACE, CENTRE, FOCAL) for seed in range(100)]
+    turns = np.array([fit.turn for fit in fits]) - 0.002
+    assert np.percentile(np.abs(turns), 90) < 3e-4
+    errors = np.array([fit.shift for fit in fits]) - [0.4, -0.2]
+    way = np.array([PLACE.column - CENTRE[1], PLACE.row - CENTRE[0]]) / np.hypot(20, 20)
+    along, across = errors @ way, errors @ [-way[1], way[0]]
+    assert across.std() < 0.05 < along.std()
+    told = np.sqrt([way @ fit.covariance[:2, :2] @ way for fit in fits])
+    assert 0.6 < np.sqrt(np.mean((along / told) ** 2)) < 1.8  # few patches tell little of how alike they are
+
+
+def test_large_frames_judge_relief_as_small_ones_do():
+    small = over_relief(3)
+    large = Patches(3 * small.places, 3 * small.shifts, small.scores, 3)
+    assert np.array_equal(large.agree, small.agree)
+    place = PLACE._replace(row=3 * PLACE.row, column=3 * PLACE.column)
+    by_small, by_large = (
+        fit_of(small, PLACE, CENTRE, FOCAL),
+        fit_of(large, place, tuple(3 * np.array(CENTRE)), 3 * FOCAL),
+    )
+    assert by_large.turn == pytest.approx(by_small.turn, abs=1e-9)
+    assert by_large.shift == pytest.approx(3 * by_small.shift)
+
+
 def test_covariance_goes_along_with_the_movement():
     rng = np.random.default_rng(2)
     pose, step = Pose(10.0, -20.0, 30.0), Pose(60.0, 5.0, 4.0)

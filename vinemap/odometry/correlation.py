@@ -123,11 +123,12 @@ def climb(search: Search, start: Place, reach: int) -> tuple[Index, float]:
     turn, row, column = (
         int(np.clip(round(value), within[0], within[-1])) for value, within in zip(sought, search.whole, strict=True)
     )
-    index: Index = (turn, row, column)
-    higher, score = peak(search, near(search, index, (1, reach, reach)))
+    box = near(search, (turn, row, column), (1, reach, reach))
+    higher, score = peak(search, box)
     for _ in range(CLIMBS):
-        if higher == index:
+        beside = near(search, higher, (1, 1, 1))
+        if all(part[0] in seen and part[-1] in seen for part, seen in zip(beside, box, strict=True)):
             break
-        index = higher
-        higher, score = peak(search, near(search, index, (1, 1, 1)))
+        box = beside
+        higher, score = peak(search, box)
     return higher, score

@@ -12,7 +12,7 @@ from vinemap.odometry.views import View, coarseness, fineness
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
 
 LEAST_OVERLAP = 0.1
 """Share of a frame that the next one must show too."""
@@ -36,22 +36,25 @@ FAINT = 1.0
 NEAR_STILL = 3.0
 """Pixels of coarse frames within which what moves with the camera draws a step to where nothing moves."""
 
-PATCHES, PATCH_HALF, PATCH_REACH = 5, 12, 6
-"""Patches of fine detail along either side of what both frames show, their half width in pixels of some 320 × 240, and
-how far from where they should be they are looked for."""
+PATCH_PITCH, PATCH_HALF, PATCH_REACH = 36.0, 12, 6
+"""Pixels of fine detail between patches of what both frames show, their half width, and how far from where they should
+be they are looked for."""
 PATCH_SCORE, PATCH_SPREAD = 0.6, 3.0
-"""Correlation of a patch that agrees, and pixels from the others' median that it may lie off."""
+"""Correlation of a patch that agrees, and pixels of fine detail from the others' median that it may lie off."""
 LEAST_PATCHES, FEWEST_PATCHES = 0.4, 3
 """Share and number of patches that must agree."""
 
 MOST_UNSURE = 1.5, np.radians(0.4)
-"""Standard deviations in pixels and radians of a step from which on the ground isn't flat enough."""
+"""Standard deviations in pixels of fine detail and radians of a step from which on the ground isn't flat enough."""
 PLANE = 0.5
 """Share of the patches' disagreement that is left if it is that of a plane that is tilted."""
 SHORT = 12.0
-"""Pixels of movement below which parallax says nothing of a tilt."""
-ALIKE = 1.6
-"""How much more patches vary together than each for itself, as neighbours err alike."""
+"""Pixels of fine detail of movement below which parallax says nothing."""
+ROUNDS = 4
+"""Times that patches are weighed by how far they disagree."""
+ALIKE, MOST_LIKE = 1.6, 0.6
+"""How much more patches vary together, at least, than each for itself, as neighbours err alike; the largest correlation
+of neighbours of which that is told."""
 LEAST_SPREAD = 0.015
 """Pixels by which patches disagree at least."""
 
@@ -65,6 +68,8 @@ class Patches(NamedTuple):
     """Pixels (n, 2) from there to where they are."""
     scores: Values
     """Correlation there (n,)."""
+    unit: int = 1
+    """Pixels of a frame along the side of one of fine detail."""
 
     @property
     def agree(self) -> Flags:
@@ -73,7 +78,7 @@ class Patches(NamedTuple):
         if not same.any():
             return np.asarray(same)
         off = self.shifts - np.median(self.shifts[same], axis=0)
-        return np.asarray(same & (np.hypot(*off.T) < PATCH_SPREAD))
+        return np.asarray(same & (np.hypot(*off.T) < PATCH_SPREAD * self.unit))
 
     @property
     def mean(self) -> float:
@@ -114,6 +119,9 @@ class Fit(NamedTuple):
 def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float) -> Fit | None:
     """Fit a movement to patches that agree, and a plane of any tilt at another height; none if they are too few.
 
+    What is higher moves further, but the same way (parallax): across the movement patches agree on any relief, and
+    count as much more as they disagree less there than along it.
+
     Parameters
     ----------
     place, centre
@@ -122,23 +130,50 @@ def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float
         Focal length in pixels.
     """
     agree = patches.agree
-    if agree.sum() < 2 * FEWEST_PATCHES:
+    n = int(agree.sum())
+    if n < 2 * FEWEST_PATCHES:
         return None
     x, y = (patches.places[agree] - [place.column, place.row]).T
-    one, none = np.ones_like(x), np.zeros_like(x)
-    far = np.array([place.column - centre[1], place.row - centre[0]]) / focal
-    rigid = np.concatenate([np.column_stack([one, none, -y]), np.column_stack([none, one, x])])
-    bent = np.concatenate([np.column_stack([x, far[0] * x, far[0] * y]), np.column_stack([y, far[1] * x, far[1] * y])])
-    shifts = patches.shifts[agree].T.ravel()
-    moved, _, _, _ = np.linalg.lstsq(rigid, shifts)
-    left = shifts - rigid @ moved
-    spread = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
-    whole = np.hstack([rigid, bent])
-    every, _, _, _ = np.linalg.lstsq(whole, shifts)
-    rest = float(np.sqrt(np.sum((shifts - whole @ every) ** 2) / max(len(left) - 6, 1)))
-    covariance = ALIKE * max(spread, LEAST_SPREAD) ** 2 * np.linalg.inv(rigid.T @ rigid)
-    slope = every[4:] if np.hypot(*far) * focal > SHORT else None
+    way = np.array([place.column - centre[1], place.row - centre[0]])
+    far = float(np.hypot(*way))
+    parallax = far > SHORT * patches.unit
+    c, s = way / far if parallax else (1.0, 0.0)
+    along, across = np.array([[c, s], [-s, c]])
+    shifts = np.array([along, across]) @ patches.shifts[agree].T
+    rigid = np.stack([np.column_stack([np.tile(axis, (n, 1)), axis[1] * x - axis[0] * y]) for axis in (along, across)])
+    orders = np.lexsort((x, y)), np.lexsort((y, x))
+    sd = np.ones((2, 1))
+    for _ in range(ROUNDS):
+        moved, covariance = _least_squares(rigid, shifts, sd)
+        left = shifts - rigid @ moved
+        squares = np.maximum(np.sum(left**2, axis=1) / (n - 1.5), LEAST_SPREAD**2)
+        sd[:, 0] = np.sqrt(squares * _alike(left, orders) if parallax else ALIKE * squares.mean())
+    ahead, aside = along @ [x, y], across @ [x, y]
+    leaning = far / focal * np.column_stack([x, y])
+    bent = np.stack([np.column_stack([ahead, leaning]), np.column_stack([aside, 0 * leaning])])
+    whole = np.concatenate([rigid, bent], axis=2)
+    every, _ = _least_squares(whole, shifts, sd)
+    rest = float(np.sqrt(np.sum((shifts - whole @ every) ** 2) / max(2 * n - 6, 1)))
+    slope, spread = every[4:] if parallax else None, float(np.sqrt(squares.mean()))
     return Fit(moved[:2], float(moved[2]), covariance, float(every[3]), slope, spread, rest)
+
+
+def _least_squares(slopes: Values, values: Values, sd: Values) -> tuple[Values, Values]:
+    """Unknowns (k,) and covariance (k, k) of slopes (2, n, k) and values (2, n) of standard deviations (2, 1)."""
+    weighted = (slopes / sd[..., None]).reshape(-1, slopes.shape[-1])
+    covariance: Values = np.linalg.pinv(weighted.T @ weighted, hermitian=True)
+    return np.asarray(covariance @ (weighted.T @ (values / sd).ravel())), covariance
+
+
+def _alike(left: Values, orders: Sequence[Ints]) -> Values:
+    """How much more what is left (2, n) varies together than each for itself, by neighbours in orders of the patches.
+
+    It is the sum of a correlation that falls off as a Gaussian's over the nodes of a lattice.
+    """
+    power = np.maximum(np.sum(left**2, axis=1), 1e-12)
+    beside = [np.sum(left[:, order[1:]] * left[:, order[:-1]], axis=1) / power for order in orders]
+    like = np.clip(np.mean(beside, axis=0), 0, MOST_LIKE)
+    return np.asarray(np.maximum(ALIKE, (1 + 2 * like + 2 * like**4) ** 2))
 
 
 def patches_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> Patches:
@@ -155,8 +190,8 @@ def patches_at(view: View, next_view: View, centre: Sequence[float], place: Plac
     low = np.maximum(corners.min(axis=0) + half, far)
     high = np.minimum(corners.max(axis=0) - half, size - 1 - far)
     if np.any(high < low):
-        return Patches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
-    grid = np.rint(np.stack(np.meshgrid(*np.linspace(low, high, PATCHES).T), axis=-1).reshape(-1, 2))
+        return Patches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), n)
+    grid = np.rint(np.stack(np.meshgrid(*map(_spaced, low, high)), axis=-1).reshape(-1, 2))
     there = grid @ matrix[:, :2].T + matrix[:, 2]
     grid = grid[np.all((there > half + 2) & (there < size - 3 - half), axis=1)].astype(int)
     shifts, scores = np.zeros((len(grid), 2)), np.zeros(len(grid))
@@ -166,7 +201,11 @@ def patches_at(view: View, next_view: View, centre: Sequence[float], place: Plac
         found = np.asarray(cv2.matchTemplate(part, own, cv2.TM_CCOEFF_NORMED), np.float32)
         _, scores[k], _, (j, i) = cv2.minMaxLoc(found)
         shifts[k] = [_vertex(found[i, :], j) - PATCH_REACH, _vertex(found[:, j], i) - PATCH_REACH]
-    return Patches((grid + 0.5) * n - 0.5, shifts * n, scores)
+    return Patches((grid + 0.5) * n - 0.5, shifts * n, scores, n)
+
+
+def _spaced(low: float, high: float) -> Values:
+    return np.linspace(low, high, max(2, round((high - low) / PATCH_PITCH) + 1))
 
 
 def _vertex(values: Values, at: int) -> float:
@@ -233,8 +272,8 @@ def doubt(
         What pieces of the frames say, one by one and together.
     """
     turned, *out = at_limits
-    place_sd, turn_sd = np.sqrt(np.diag(fit.covariance))[1:] if fit else (0.0, 0.0)
-    crooked = place_sd > MOST_UNSURE[0] or turn_sd > MOST_UNSURE[1]
+    *place_sd, turn_sd = np.sqrt(np.diag(fit.covariance)) if fit else (0.0, 0.0)
+    crooked = max(place_sd) > MOST_UNSURE[0] * patches.unit or turn_sd > MOST_UNSURE[1]
     doubts = {
         "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
         "overlap": any(out),

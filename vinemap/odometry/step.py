@@ -17,7 +17,7 @@ from vinemap.odometry.field import cleaner_of
 from vinemap.odometry.judgement import CHANGED, CHANGED_ROUGHLY, MOST_RIVAL, agreement_at, doubt, fit_of, patches_at
 from vinemap.odometry.poses import Pose, moved, onward
 from vinemap.odometry.refinement import Method, refine
-from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, fineness, view_of
+from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,8 +41,6 @@ ASIDE = 3
 CLEAR_LEAD, LACKS = 0.5, 0.02
 """Of what patches lack of a full correlation at the next best place, the most that they lack at a better one; and what
 they lack anyway."""
-FINE_SPREAD = 0.2
-"""Pixels by which patches disagree from which on they know better, even of frames that they see more coarsely."""
 LITTLE = 0.05
 """Share of a template that may show no ground."""
 UNSURE = (1.0, 1.0, 1e-4)
@@ -186,7 +184,7 @@ def motion_between(
     place = refine(fine, top, method)
     patches = patches_at(view, next_view, centre, place)
     fit = fit_of(patches, place, centre, camera.fx)
-    if fit and method == "aligned" and (fineness(view.image) == 1 or fit.spread > FINE_SPREAD):
+    if fit and method == "aligned":
         place = fit.corrected(place)
     agreement, overlap = agree(place, most_change=CHANGED if method == "aligned" else CHANGED_ROUGHLY)
     score = dict(peaks)[top]
