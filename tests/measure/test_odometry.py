@@ -1,5 +1,7 @@
 """The trials of odometry measure what is true, and say what misses its bar."""
 
+from itertools import accumulate
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,16 @@ from click.testing import CliRunner
 
 from vinemap.errors import InputError
 from vinemap.measure.odometry.__main__ import main
-from vinemap.measure.odometry.tables import drift_table, loss_table, mark, size_table, terrain_tables, trouble_table
+from vinemap.measure.odometry.bridges import LOST, Bridge, bridges, lost_frames, wheels_of
+from vinemap.measure.odometry.tables import (
+    bridge_table,
+    drift_table,
+    loss_table,
+    mark,
+    size_table,
+    terrain_tables,
+    trouble_table,
+)
 from vinemap.measure.odometry.trials import (
     FAILURE,
     METHODS,
@@ -23,7 +34,7 @@ from vinemap.measure.odometry.trials import (
     template_offset,
 )
 from vinemap.measure.odometry.troubles import Outcome
-from vinemap.odometry.poses import STILL, Pose
+from vinemap.odometry.poses import STILL, Pose, onward
 from vinemap.simulate.camera import HIGH, LOW, PIECE, lay_ground
 from vinemap.simulate.steps import beyond, unrelated, walk
 
@@ -150,6 +161,40 @@ def test_paths_and_times_are_held_against_their_bars():
     slow = Size(0.2, {"320 × 240": 0.01, "1280 × 720": 0.05}, 90.0, {})
     assert misses(size_table([slow], 0.02)) == ["10.0!, 9.0"]
     assert misses(size_table([slow._replace(share=0.1)], 0.02)) == []
+
+
+def test_a_fifth_of_a_path_is_lost_but_not_its_ends():
+    lost = lost_frames(160, np.random.default_rng(3))
+    assert lost.mean() == pytest.approx(LOST)
+    assert not lost[:5].any()
+    assert not lost[-5:].any()
+
+
+def test_wheels_tell_the_way_nearly():
+    poses = list(accumulate([Pose(60.0, 0.0, 2.0)] * 40, onward, initial=STILL))
+    told = wheels_of(poses, np.random.default_rng(1))
+    assert told.speeds.mean() == pytest.approx(300, rel=0.2)
+    assert told.speeds.std() > 1
+    assert told.rates.mean() == pytest.approx(10, abs=2)
+
+
+def test_lost_stretches_are_bridged(monkeypatch):
+    monkeypatch.setattr("vinemap.measure.odometry.bridges.STRETCHES", 1)
+    found = bridges(["gravel"], 1, length_mm=2000.0, seed=4)
+    assert found["wheels"].end[0] < 0.5 * found["nothing"].end[0]
+    assert found["fixes at both ends"].end[0] < 60  # three standard deviations of a fix
+    assert found["nothing"].length == pytest.approx(2000, rel=0.05)
+
+
+def test_bridges_are_held_against_their_bars():
+    worst, end = np.array([40.0, 60.0]), np.array([50.0, 100.0])
+    names = "nothing", "wheels", "wheels, fixes at both ends"
+    lines = bridge_table({name: Bridge(worst, end, 8000.0) for name in names})
+    assert [line[1:] for line in lines[1:]] == [
+        ["0.94, 1.25", "0.050, 0.060"],
+        ["0.94, 1.25!", "0.050, 0.060"],
+        ["0.94, 1.25", "0.050, 0.060!"],
+    ]
 
 
 @pytest.fixture

@@ -15,8 +15,10 @@ import click
 
 from vinemap.cli.options import FILE
 from vinemap.measure.odometry import plots
+from vinemap.measure.odometry.bridges import bridges
 from vinemap.measure.odometry.tables import (
     MOST_SECONDS,
+    bridge_table,
     drift_table,
     loss_table,
     relief_table,
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
     Panels = list[list[Panel]]
 
 PAGE = click.Path(exists=True, dir_okay=False, path_type=Path)
-PARTS = ("terrains", "relief", "sizes", "lost", "troubles", "paths")
+PARTS = ("terrains", "relief", "sizes", "lost", "troubles", "paths", "bridges")
 ROUGH = 8.0
 """Millimetres of relief on which steps are lost, too."""
 TITLES = {
@@ -61,6 +63,7 @@ TITLES = {
     "lost": "Lost: errors above 5 mm",
     "troubles": "In trouble: steps that are believed, and those that are wrong all the same",
     "paths": "Error at the end of sinusoidal paths of 9.6 m, over their length (Fig. 4.8)",
+    "bridges": "Paths of 9.6 m of which a fifth is lost",
 }
 
 
@@ -110,6 +113,11 @@ def paths(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines], 
     return {"paths": drift_table(found)}, {"paths": [boxes]}
 
 
+def bridged(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines], dict[str, Panels]]:
+    """Table of paths with lost stretches."""
+    return {"bridges": bridge_table(bridges(grounds, count, seed=700))}, {}
+
+
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("parts", nargs=-1, type=click.Choice(PARTS), metavar="[PART]...")
 @click.option("--steps", type=click.IntRange(1), default=300, show_default=True, help="Random steps a ground.")
@@ -142,6 +150,7 @@ def main(
         "lost": partial(lost, grounds, pairs),
         "troubles": partial(in_trouble, grounds, steps),
         "paths": partial(paths, grounds, count),
+        "bridges": partial(bridged, grounds, count),
     }
     tables: dict[str, Lines] = {}
     panels: dict[str, Panels] = {}

@@ -12,6 +12,7 @@ from vinemap.measure.odometry.trials import CAMERAS, METHODS, RELIEFS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from vinemap.measure.odometry.bridges import Bridge
     from vinemap.measure.odometry.trials import ByMethod, Drift, Losses, Size
     from vinemap.measure.odometry.troubles import Outcome
     from vinemap.odometry.refinement import Method
@@ -33,6 +34,10 @@ LEAST_BELIEVED, MOST_BELIEVED_WRONG = {"none": 98.0, "spots": 50.0, "mud": 50.0}
 """Percent of steps that are believed without trouble and through dirt; share of all that may be wrong and believed."""
 MOST_DRIFT, MOST_HEADING = 0.25, 0.15
 """Of paths: share of the standard algorithm's error of the place, and degrees a metre."""
+BRIDGED_END = {"wheels": 1.0}
+"""Percent of the way by which paths with lost stretches may be off at their end."""
+BRIDGED_WORST = {"fixes at both ends": 0.05, "wheels, fixes at both ends": 0.05}
+"""Metres by which they may be off anywhere."""
 
 
 def mark(value: float, bar: float = np.inf, digits: int = 3, *, at_least: bool = False) -> str:
@@ -161,4 +166,20 @@ def drift_table(found: Mapping[str, Drift]) -> Lines:
             "" if np.isnan(squared).any() else mark(float(squared.mean()), float(high), 2),
         ]
         lines.append([NAMES.get(name, name), *cells])
+    return lines
+
+
+def bridge_table(found: Mapping[str, Bridge]) -> Lines:
+    """Errors of paths with lost stretches, a line for each way to bridge them."""
+    lines = [["bridged by", "at the end: mean, worst % of the way", "anywhere: mean, worst m"]]
+    for name, (worst, end, length) in found.items():
+        share, metres = 100 * end / length, worst / 1000
+        most, far = BRIDGED_END.get(name, np.inf), BRIDGED_WORST.get(name, np.inf)
+        lines.append(
+            [
+                name,
+                f"{mark(share.mean(), most, 2)}, {mark(share.max(), most, 2)}",
+                f"{mark(metres.mean(), far)}, {mark(metres.max(), far)}",
+            ]
+        )
     return lines
