@@ -49,6 +49,8 @@ class Search(NamedTuple):
     """Whether the template is turned by cubic instead of linear interpolation."""
     whole: Box
     """All angles, in steps, and all rows and columns."""
+    turned: dict[int, Values]
+    """The template turned by so many steps, where it was before."""
 
 
 def search_of(
@@ -57,7 +59,7 @@ def search_of(
     """Look for a template at all places of the second image and at angles between two, in degrees."""
     height, width = b.shape
     turns = range(int(np.floor(angles[0] / step)) - 1, int(np.ceil(angles[1] / step)) + 2)
-    return Search(a, b, centre, half, step, cubic, (turns, range(half, height - half), range(half, width - half)))
+    return Search(a, b, centre, half, step, cubic, (turns, range(half, height - half), range(half, width - half)), {})
 
 
 def place_at(search: Search, index: Sequence[float] | Values) -> Place:
@@ -77,15 +79,26 @@ def correlation(search: Search, box: Box) -> Values:
     import cv2
 
     turns, rows, columns = box
-    half, size = search.half, 2 * search.half + 1
-    flags = (cv2.INTER_CUBIC if search.cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
+    half = search.half
     part = search.b[rows[0] - half : rows[-1] + half + 1, columns[0] - half : columns[-1] + half + 1]
     out = np.empty((len(turns), len(rows), len(columns)), np.float32)
     for turn, plane in zip(turns, out, strict=True):
-        matrix = warp(turn * search.step, search.centre, (half, half))
-        template = cv2.warpAffine(search.a, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        plane[:] = cv2.matchTemplate(part, template, cv2.TM_CCOEFF_NORMED)
+        plane[:] = cv2.matchTemplate(part, _template(search, turn), cv2.TM_CCOEFF_NORMED)
     return out
+
+
+def _template(search: Search, turn: int) -> Values:
+    """The template turned by so many steps."""
+    import cv2
+
+    if turn not in search.turned:
+        half, size = search.half, 2 * search.half + 1
+        flags = (cv2.INTER_CUBIC if search.cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
+        matrix = warp(turn * search.step, search.centre, (half, half))
+        search.turned[turn] = np.asarray(
+            cv2.warpAffine(search.a, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        )
+    return search.turned[turn]
 
 
 def near(search: Search, index: Sequence[int], reach: Sequence[int]) -> Box:
