@@ -41,6 +41,7 @@ def place(vineyard, tmp_path_factory):
 def served(place):
     """The same folder with a server that has the runs of all flows, whose starts take longest."""
     served = Place(place)
+    (place / "prefect").mkdir(exist_ok=True)
     with served.server(place / "prefect"):
         yield served
 
@@ -196,19 +197,24 @@ def test_only_what_may_heal_is_tried_again(place, served):
 
 
 def test_drives_in_one_job(served, tmp_path):
-    """A drive that fails costs no other; each stage is a task run."""
+    """A drive that fails, of its frames or of its own sensors' files, costs no other; each stage is a task run."""
     for k, image in enumerate(images(poses(4))):
         (tmp_path / "frames").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), image)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(LOW.model_dump(exclude_defaults=True)))
     (tmp_path / "drives.yaml").write_text(
         "camera: camera.yaml\nout: tracks\ndrives:\n  bad: {frames: [nothing]}\n"
+        "  unplaced: {frames: [frames], fixes: fixes.csv}\n  slipping: {frames: [frames], motion: wheels.csv}\n"
         "  good: {frames: [frames], start: [44.61167, 7.92442, 72.5]}\n"
     )
     done = served.run("-m", "flows.odometry", "drives.yaml", cwd=tmp_path)
     assert done.returncode == 1
     assert done.stdout == "tracks/good_track.gpkg: 0.12 m in 4 frames\n"
-    assert done.stderr == "vinemap: bad: nothing: no such file or folder: give images, folders of images, or videos\n"
+    assert done.stderr.splitlines() == [
+        "vinemap: bad: nothing: no such file or folder: give images, folders of images, or videos",
+        "vinemap: unplaced: fixes.csv: fixes need a start: give --start lat,lon,heading, roughly",
+        "vinemap: slipping: wheels.csv: can't be read (No such file or directory): give a CSV with a line of names",
+    ]
     assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["good_track.gpkg"]
 
 
