@@ -102,6 +102,7 @@ def make_product(
 
         cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
         del found
+        machine.give_back()
 
         def write() -> list[str]:
             how = settings.product.model_dump(include={"plain", "geoid", "audit"})
