@@ -6,7 +6,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.canopy.model import CanopyModel, find_canopies, model_sections
-from vinemap.compute import machine
 from vinemap.config.settings import Settings
 from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.evaluate.shift import Shift, measure_shift
@@ -135,5 +134,4 @@ def model_canopies(found: RowMap, settings: Settings | None = None, *, step: Cal
     found.cloud.forget()
     options = settings.polygon.model_dump() | {"min_points": settings.canopy.min_points}
     model: CanopyModel = step("Canopy", model_sections, canopies, found.dtm.crs, **options)
-    machine.give_back()
     return model

@@ -14,7 +14,6 @@ from vinemap.canopy.numbers import as_seen, judge_canopies, summarise_rows
 from vinemap.chain import map_rows, model_canopies
 from vinemap.cloud.tiles import moved
 from vinemap.cloud.write import write_classified
-from vinemap.compute import machine
 from vinemap.compute.threads import aside
 from vinemap.evaluate.meshes import measure_meshes
 from vinemap.evaluate.trunks import vines_in_rows
@@ -84,7 +83,6 @@ def make_product(
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
         rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
         del model  # much memory, that what follows doesn't need
-        machine.give_back()
         outlines = parcel_layer(parcel, rows, polygon, points)
         layers = {
             "rows": rows,
@@ -102,7 +100,6 @@ def make_product(
 
         cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
         del found
-        machine.give_back()
 
         def write() -> list[str]:
             how = settings.product.model_dump(include={"plain", "geoid", "audit"})

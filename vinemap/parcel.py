@@ -125,6 +125,7 @@ def follow(
     seconds: dict[str, float] = {}
 
     def run(name: str, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        machine.give_back()  # of what the stages before are done with
         start = time.perf_counter()
         out: T = step(name, function, *args, **kwargs)
         seconds[name] = round(time.perf_counter() - start, 3)

@@ -117,9 +117,10 @@ def test_a_band_of_two_standard_deviations_lies_about_the_track(recording, tmp_p
     out = tmp_path / "track.gpkg"
     map_drive([recording], out, camera=LOW, start=START)
     found, band = (gpd.read_file(out, layer=name) for name in ("poses", "band"))
-    assert (found["sd_m"].diff()[1:] > -0.05 * found["sd_m"].max()).all()  # one from an earlier frame may be surer
-    assert found["sd_m"].iloc[0] == 0
-    assert 0 < found["sd_m"].iloc[-1] < 0.002
+    heading = found.set_index("pose")["sd_heading_deg"]
+    assert (heading.iloc[1:].to_numpy() > heading.loc[found["measured_from"][1:]].to_numpy()).all()
+    assert found["sd_m"][0] == 0
+    assert found["sd_m"][1] < found["sd_m"].iloc[-1] < 0.002
     assert found["height_mm"].to_numpy() == pytest.approx(245, abs=0.5)
     assert len(band) == 1
     assert band.contains(found.geometry.iloc[-1]).all()

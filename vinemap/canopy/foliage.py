@@ -164,8 +164,8 @@ def _separate(
 @compiled
 def _is_post(y: Values, up: Values, canopy: Flags, low: float) -> bool:
     """Whether what stands above some height is thin; strays beside it don't make it wide."""
-    above, first = np.empty(len(y)), 0 * len(y)  # a plain 0 would have `quantile` compiled twice
-    n = first
+    above = np.empty(len(y))
+    n = first = int(np.int64(0))  # a plain 0 would have `quantile` compiled twice
     for p in range(len(y)):
         if canopy[p] and up[p] > low:
             above[n] = y[p]

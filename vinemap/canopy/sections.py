@@ -217,7 +217,7 @@ def _take_each(
 ) -> tuple[NDArray[np.float32], Values, NDArray[np.int32]]:
     """Points (n, 2) of sections whose soil lies at ``level`` (m,), their heights, and which of the cloud's they are."""
     n = len(index)
-    points, heights, members = np.empty((n, 2), height.dtype), np.empty(n, height.dtype), np.empty(n, member.dtype)
+    points, heights, members = np.empty((n, 2), np.float32), np.empty(n, height.dtype), np.empty(n, member.dtype)
     for k in range(len(level)):
         for i in range(start[k], start[k + 1]):
             p = index[i]

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from vinemap.compute import machine
 
@@ -99,10 +99,24 @@ def stretches(n: int, most: float = math.inf) -> list[tuple[int, int]]:
     return list(pairwise(bounds))
 
 
-def strips(shape: tuple[int, int], *, beside: int) -> list[tuple[int, int]]:
-    """Strips of a raster's rows (ny, nx) that are worked one by one, by so many rows beside them: first and last + 1.
+class Strip(NamedTuple):
+    """Some rows of a raster, and those that they are worked out from."""
+
+    own: slice
+    around: slice
+    """Its own rows, and so many on both sides as there are of those that tell them."""
+    inner: slice
+    """Its own among those around."""
+
+
+def strips(shape: tuple[int, int], *, beside: int) -> list[Strip]:
+    """Strips of a raster (ny, nx) that are worked one by one, from themselves and so many rows beside.
 
     A core's cache holds one, and what lies beside it is little of it.
     """
     ny, nx = shape
-    return stretches(ny, max(CACHED / nx, 8 * beside))
+    out = []
+    for first, last in stretches(ny, max(CACHED / nx, 8 * beside)):
+        start = max(first - beside, 0)
+        out.append(Strip(slice(first, last), slice(start, last + beside), slice(first - start, last - start)))
+    return out

@@ -83,6 +83,12 @@ def normals(curve: Values, *, smoothing: float) -> Values:
     return out
 
 
+def across(curve: Values, offsets: Values, *, smoothing: float) -> Values:
+    """Places (n, m, 2) beside a curve (n, 2), at offsets (m,) to its left along its normals, smoothed so."""
+    out: Values = curve[:, None] + offsets[:, None] * normals(curve, smoothing=smoothing)[:, None]
+    return out
+
+
 def way_along(curve: Values) -> Values:
     """Metres (n,) from the start of a curve (n, 2) to each of its points."""
     return _way(np.ascontiguousarray(curve, dtype=np.float64))

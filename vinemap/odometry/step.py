@@ -41,6 +41,8 @@ ASIDE = 3
 CLEAR_LEAD, LACKS = 0.5, 0.02
 """Of what patches lack of a full correlation at the next best place, the most that they lack at a better one; and what
 they lack anyway."""
+FINE_SPREAD = 0.2
+"""Pixels by which patches disagree from which on they know better where frames lie that they see more coarsely."""
 LITTLE = 0.05
 """Share of a template that may show no ground."""
 UNSURE = (1.0, 1.0, 1e-4)
@@ -185,7 +187,8 @@ def motion_between(
     patches = patches_at(view, next_view, centre, place)
     fit = fit_of(patches, place, centre, camera.fx)
     if fit and method == "aligned":
-        place = fit.corrected(place)
+        turned, moves = fit.corrected(place), patches.unit == 1 or fit.spread > FINE_SPREAD
+        place = turned if moves else place._replace(angle=turned.angle)
     agreement, overlap = agree(place, most_change=CHANGED if method == "aligned" else CHANGED_ROUGHLY)
     score = dict(peaks)[top]
     at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]

@@ -78,7 +78,7 @@ def _laid_together(image: Values, offsets: Values, curtains: float) -> Values:
 @compiled
 def _centre(image: Values, offsets: Values, reach: float, cutoff: float) -> Values:
     """Smoothed centroids (n,) of canopy (n, m) within reach of them."""
-    n, first = len(image), 0 * len(image)  # a plain 0 would have `quantile` compiled twice
+    n, first = len(image), int(np.int64(0))  # a plain 0 would have `quantile` compiled twice
     excess = _excess(blurred_down(image, cutoff / 20, CARRIED_ON))
     measured, weight, robust, ranked = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     centre = image[:, 0].copy()

@@ -18,7 +18,7 @@ from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import blurred
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import between, extend, normals, resample, way_along
+from vinemap.geo.curve import across, between, extend, normals, resample, way_along
 from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
@@ -180,7 +180,7 @@ def _fit(
 def _within(canopies: shapely.Geometry, curve: Values, offsets: Values) -> Flags:
     """Cells (stations, cells across) of a row straightened along a curve that lie in canopies."""
     shapely.prepare(canopies)
-    cells = curve[:, None] + offsets[:, None] * normals(curve, smoothing=1 / CELL)[:, None]
+    cells = across(curve, offsets, smoothing=1 / CELL)
     out: Flags = shapely.contains_xy(canopies, cells[..., 0], cells[..., 1])
     return out
 

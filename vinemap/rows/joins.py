@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
-from vinemap.geo.curve import at, between, normals, resample, way_along
+from vinemap.geo.curve import across, at, between, resample, way_along
 from vinemap.geo.raster import sample
 from vinemap.rows.centre_line import CELL, smooth_course
 from vinemap.rows.tracks import gaps_between, on_tracks
@@ -333,5 +333,4 @@ def _held_of(tails: Sequence[Values], rows: Sequence[Standing], cover: Raster) -
 def _cells(curve: Values, half: float) -> tuple[Values, Ints]:
     """Cells (m, 2) of a canopy along a curve (n, 2), and which of its points they lie beside."""
     aside = np.arange(-half, half + CELL / 2, CELL)
-    xy = curve[:, None] + aside[:, None] * normals(curve, smoothing=1 / CELL)[:, None]
-    return xy.reshape(-1, 2), np.repeat(np.arange(len(curve)), len(aside))
+    return across(curve, aside, smoothing=1 / CELL).reshape(-1, 2), np.repeat(np.arange(len(curve)), len(aside))

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.threads import Strip
 
     Counts = NDArray[np.uint16]
 
@@ -150,12 +151,10 @@ def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Val
     """Points (ny, nx) of canopy by all points and so many more, both blurred by a Gaussian of sigma cells."""
     reach, cover = int(4 * sigma + 0.5), np.empty(canopy.shape, dtype=np.float32)
 
-    def share(rows: tuple[int, int]) -> None:
-        first, last = rows
-        around = slice(max(first - reach, 0), last + reach)
-        some, of_all = (gaussian_filter(layer[around], sigma, output=np.float32) for layer in (canopy, everything))
-        inner = slice(first - around.start, last - around.start)
-        np.divide(some[inner], of_all[inner] + np.float32(more), out=cover[first:last])
+    def share(strip: Strip) -> None:
+        blurred = (gaussian_filter(layer[strip.around], sigma, output=np.float32) for layer in (canopy, everything))
+        some, of_all = (layer[strip.inner] for layer in blurred)
+        np.divide(some, of_all + np.float32(more), out=cover[strip.own])
 
     in_threads(share, strips(canopy.shape, beside=reach))
     return cover

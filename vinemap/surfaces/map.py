@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinemap.compute import machine
 from vinemap.geo.raster import grid_over
 from vinemap.surfaces.ceiling import heights_of_vines
 from vinemap.surfaces.ground import terrain_model
@@ -35,5 +34,4 @@ def map_surfaces(points: Cloud, settings: Settings) -> tuple[Cloud, Raster, Rast
     dtm = terrain_model(points, **settings.ground.model_dump(exclude=PDALS))
     cloud, chm = heights_of_vines(points, dtm, resolution=settings.ground.resolution, high=settings.cover.high)
     seen = seen_cells(points, grid_over(*points.extent, resolution=settings.cover.resolution))
-    machine.give_back()
     return cloud, dtm, chm, seen

@@ -12,6 +12,7 @@ from vinemap.geo.raster import block_sum
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Floats
+    from vinemap.compute.threads import Strip
 
 NARROWEST = 1.2
 """Cells of the narrowest plane that is still fitted well: wider ones are fitted on blocks of cells."""
@@ -74,16 +75,15 @@ def _plane_fit(level: Floats, weight: Floats, sigma: float) -> Floats:
         out: Floats = correlate1d(down, kernels[j], axis=1, mode="constant")
         return out
 
-    def fitted(rows: tuple[int, int]) -> Floats:
-        around = slice(max(rows[0] - radius, 0), rows[1] + radius)
-        weights = weight[around]
-        values = weights * level[around]
+    def fitted(strip: Strip) -> Floats:
+        weights = weight[strip.around]
+        values = weights * level[strip.around]
         w, wi, wj, wii, wij, wjj = (moment(weights, *ij) for ij in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)))
         z, zi, zj = (moment(values, *ij) for ij in ((0, 0), (1, 0), (0, 1)))
         w, wii, wjj = w + RIDGE, wii + RIDGE, wjj + RIDGE
         # Cramer's rule for the constant term of the symmetric 3 x 3 normal equations.
         a, b, c = wii * wjj - wij**2, wij * wj - wi * wjj, wi * wij - wii * wj
         out: Floats = (a * z + b * zi + c * zj) / (a * w + b * wi + c * wj)
-        return out[rows[0] - around.start :][: rows[1] - rows[0]]
+        return out[strip.inner]
 
     return np.concatenate(in_threads(fitted, strips(level.shape, beside=radius)))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.geo.curve import normals, resample, way_along
+from vinemap.geo.curve import across, resample, way_along
 from vinemap.geo.raster import Grid, block_sum, cell_of
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Seen(NamedTuple):
         curve = resample(curve, step)
         way = way_along(curve)
         offsets = np.arange(-half, half + step / 2, step)
-        xy = curve[:, None] + offsets[:, None] * normals(curve, smoothing=1.0)[:, None]
+        xy = across(curve, offsets, smoothing=1.0)
         shown = self.points.ravel()[cell_of(xy.reshape(-1, 2), self.fine)].reshape(xy.shape[:2]).any(axis=1)
         known = way[shown]
         ends = np.concatenate([way[:1], known, way[-1:]])

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vinemap.measure.odometry.trials import path, views
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
 from vinemap.odometry.sensors import Odometer, Places, Wheels, pulled
 from vinemap.odometry.track import follow
-from vinemap.simulate.camera import LOW, lay_ground, render, sinusoid
+from vinemap.simulate.camera import LOW
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,26 +42,22 @@ class Bridge(NamedTuple):
     end: Values
     """Millimetres (n,) by which the last one is."""
     length: float
-    """Of a path in mm."""
+    """Of a path in metres."""
 
 
 def bridges(
     grounds: Sequence[str | Path], count: int, *, length_mm: float = 9600.0, seed: int = 0
 ) -> dict[str, Bridge]:
     """Errors of tracks along the thesis's sinusoidal path, on ground after ground, by what bridges lost stretches."""
-    poses = [pose._replace(x_mm=pose.x_mm - length_mm / 2 - LOW.x_mm) for pose in sinusoid(length_mm=length_mm)]
+    poses, length = path(length_mm)
     true = [moved(poses[0], pose) for pose in poses]
-    length = sum(float(np.hypot(*moved(*step)[:2])) for step in pairwise(poses))
     times = PERIOD * np.arange(len(poses))
     found: dict[str, list[Values]] = {}
     for k in range(count):
         rng = np.random.default_rng(seed + k)
-        ground = lay_ground(grounds[k % len(grounds)], size_mm=(length_mm + 700.0, 1100.0), seed=seed + k)
+        seen = views(poses, grounds[k % len(grounds)], length_mm, seed=seed + k)
         lost = lost_frames(len(poses), rng)
-        frames = [
-            Frame(str(i), float(times[i]), None if lost[i] else render(ground, pose, seed=1000 * (seed + k) + i))
-            for i, pose in enumerate(poses)
-        ]
+        frames = [Frame(str(i), float(times[i]), None if lost[i] else image) for i, image in enumerate(seen)]
         odometer = Odometer(wheels_of(true, rng))
         ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, ACCURACY, (2, 2))
         places = Places(times[[0, -1]], ends, np.full(2, ACCURACY))

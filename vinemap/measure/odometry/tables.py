@@ -173,7 +173,7 @@ def bridge_table(found: Mapping[str, Bridge]) -> Lines:
     """Errors of paths with lost stretches, a line for each way to bridge them."""
     lines = [["bridged by", "at the end: mean, worst % of the way", "anywhere: mean, worst m"]]
     for name, (worst, end, length) in found.items():
-        share, metres = 100 * end / length, worst / 1000
+        share, metres = 0.1 * end / length, worst / 1000
         most, far = BRIDGED_END.get(name, np.inf), BRIDGED_WORST.get(name, np.inf)
         lines.append(
             [

@@ -232,19 +232,28 @@ def drifts(
     seed: int = 0,
 ) -> dict[str, Drift]:
     """Errors that ways to follow frames gather along the thesis's sinusoidal path, on ground after ground."""
-    poses = [pose._replace(x_mm=pose.x_mm - length_mm / 2 - LOW.x_mm) for pose in sinusoid(length_mm=length_mm)]
-    length = sum(float(np.hypot(*moved(*step)[:2])) for step in pairwise(poses)) / 1000
-    size = length_mm + 700.0, 1100.0
+    poses, length = path(length_mm)
     gathered: dict[str, list[tuple[float, float, float]]] = {name: [] for name in followers}
     for k in range(count):
-        ground = lay_ground(grounds[k % len(grounds)], size_mm=size, seed=seed + k)
-        frames = [render(ground, pose, seed=1000 * (seed + k) + i) for i, pose in enumerate(poses)]
+        frames = views(poses, grounds[k % len(grounds)], length_mm, seed=seed + k)
         for name, followed in followers.items():
             pose, covariance = followed(frames)
             off = moved(moved(poses[0], poses[-1]), pose)
             squared = np.nan if covariance is None else _squared(moved(poses[0], poses[-1]), pose, covariance)
             gathered[name].append((float(np.hypot(*off[:2])) / length, abs(off.heading_deg) / length, squared))
     return {name: Drift(*np.transpose(errors)) for name, errors in gathered.items()}
+
+
+def path(length_mm: float) -> tuple[list[Pose], float]:
+    """Poses along the thesis's sinusoidal path of so many millimetres ahead, and metres of the way along it."""
+    poses = [pose._replace(x_mm=pose.x_mm - length_mm / 2 - LOW.x_mm) for pose in sinusoid(length_mm=length_mm)]
+    return poses, sum(float(np.hypot(*moved(*step)[:2])) for step in pairwise(poses)) / 1000
+
+
+def views(poses: Sequence[Pose], ground: str | Path, length_mm: float, *, seed: int) -> list[Image]:
+    """What a camera sees of ground at poses along such a path."""
+    laid = lay_ground(ground, size_mm=(length_mm + 700.0, 1100.0), seed=seed)
+    return [render(laid, pose, seed=1000 * seed + i) for i, pose in enumerate(poses)]
 
 
 def _squared(truth: Pose, pose: Pose, covariance: Values) -> float:
