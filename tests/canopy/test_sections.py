@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import CRS
 
+from tests.sections import many_sections, separate
 from vinemap.canopy.feet import find_feet
 from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.growth import foliage_reach
@@ -23,7 +24,7 @@ from vinemap.canopy.numbers import (
     tabulate_sections,
 )
 from vinemap.canopy.peeling import peel_sections
-from vinemap.canopy.points import NO_SECTIONS, Sections, canopy_size, join
+from vinemap.canopy.points import NO_SECTIONS, join
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.raster import Grid, Raster
@@ -46,11 +47,6 @@ def gaps_frame(*gaps):
 def cut(xyz, rows, gaps, dtm, **options):
     """Sections of a cloud whose heights are its z."""
     return join(cut_sections(PointCloud(xyz, UTM, heights=xyz[:, 2]), rows, gaps, dtm, lambda s: s, **options))
-
-
-def separate(sections):
-    """The canopy of the sections that have one."""
-    return living_canopies([separate_canopy(sections)])
 
 
 def flat(west, south, size=60.0, level=0.0):
@@ -151,42 +147,6 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     assert rows["volume_m3"].sum() == pytest.approx(0.5 * 0.25 * m, rel=0.03)
 
 
-def one_section(points, heights=None):
-    points = np.asarray(points, dtype=float)
-    one = np.ones(1)
-    start = np.array([0, len(points)])
-    return Sections(
-        np.array([1]),
-        one,
-        np.zeros((1, 3)),
-        np.array([[1.0, 0]]),
-        2.5 * one,
-        start,
-        points,
-        points[:, 1] if heights is None else heights,
-        np.arange(len(points)),
-    )
-
-
-def test_soil_noise_on_flat_ground_is_no_canopy():
-    """Where h ≈ 0 the printed plane cuts through the soil, and half of its noise would be canopy."""
-    rng = np.random.default_rng(0)
-    soil = np.column_stack([rng.uniform(-1.2, 1.2, 200), rng.normal(0, 0.03, 200)])
-    leaves = np.column_stack([rng.normal(0, 0.2, 100), rng.uniform(0.6, 1.9, 100)])
-    ((canopy, _, _),) = separate(one_section(np.concatenate([soil, leaves])))
-    assert len(canopy.points) > 90
-    assert canopy.points[:, 1].min() > 0.5
-
-
-def test_flyers_are_no_canopy():
-    rng = np.random.default_rng(0)
-    leaves = np.column_stack([rng.normal(0, 0.15, 150), rng.uniform(0.6, 1.9, 150)])
-    flyers = np.array([[0.85, 1.5], [-0.8, 2.6], [0.7, 2.2]])
-    ((canopy, _, _),) = separate(one_section(np.concatenate([leaves, flyers])))
-    assert np.abs(canopy.points[:, 0]).max() < 0.6
-    assert canopy.points[:, 1].max() < 2.0
-
-
 def test_quantile_of_each_section():
     rng = np.random.default_rng(0)
     n = np.array([1, 0, 5, 100, 2])
@@ -195,18 +155,6 @@ def test_quantile_of_each_section():
     for q in (0.02, 0.5, 0.985):
         expected = [np.quantile(values[a:b], q) if b > a else 0 for a, b in pairwise(start)]
         assert np.allclose(quantile_of(values, start, q), expected)
-
-
-def many_sections(points, *, spacing=2.5, step=0.25, member=None):
-    """Sections of one row with the points of each, on flat soil."""
-    m = len(points)
-    start = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
-    flat = np.concatenate(points) if m else np.empty((0, 2))
-    way = np.tile([1.0, 0], (m, 1))
-    position = step * np.arange(m)
-    origin = np.column_stack([position, np.zeros((m, 2))])
-    member = np.arange(len(flat)) if member is None else np.concatenate(member)
-    return Sections(np.ones(m, int), position, origin, way, np.full(m, spacing), start, flat, flat[:, 1], member)
 
 
 @pytest.mark.parametrize("n", [25, 60, 200, 800])
@@ -306,46 +254,3 @@ def test_a_row_shorter_than_a_step():
     model = model_sections(separate(sections), UTM)
     assert len(model.table) == 2
     assert summarise_rows(rows, model.table, step=0.25)["volume_m3"].iloc[0] < 0.1
-
-
-@pytest.mark.parametrize(
-    ("height", "half", "spacing"), [(0.6, 0.1, 2.0), (1.9, 0.25, 2.5), (3.1, 1.1, 4.5), (1.7, 0.8, 1.8)]
-)
-def test_the_size_of_a_row_is_what_holds_its_canopy(height, half, spacing):
-    """Over weeds, and beside a cover crop half as high as tall rows."""
-    rng = np.random.default_rng(0)
-    canopy = np.column_stack([rng.uniform(-half, half, 4000), rng.uniform(0.15 * height, height, 4000)])
-    weeds = np.column_stack([rng.uniform(-spacing / 2, spacing / 2, 4000), rng.uniform(0, 0.15, 4000)])
-    strip = np.column_stack([rng.uniform(0.8, 1.2, 2000), rng.uniform(0, 0.4 * height, 2000)])
-    left, up = np.concatenate([canopy, weeds, strip]).T
-    top, side = canopy_size(left, up, spacing, 3.6)
-    assert top == pytest.approx(height, rel=0.15)
-    assert half <= side <= min(1.5 * half + 0.3, spacing / 2)
-    assert canopy_size(left[:0], up[:0], spacing, 3.6) == (3.6, spacing / 2)
-
-
-def test_low_and_wide_canopies_keep_their_points():
-    rng = np.random.default_rng(0)
-    for height, half, spacing in ((0.55, 0.1, 2.0), (3.1, 1.1, 4.5)):
-        box = np.column_stack([rng.uniform(-half, half, 3000), rng.uniform(0.1 * height, height, 3000)])
-        (canopy,) = separate(many_sections([box] * 3, spacing=spacing))
-        points = canopy.sections.points
-        assert np.abs(points[:, 0]).max() == pytest.approx(half, abs=0.02)
-        assert points[:, 1].max() == pytest.approx(height, abs=0.02)
-        assert len(points) > 0.65 * 9000
-
-
-def test_posts_that_stick_out_of_low_vines_are_cut_off():
-    """Few points of one do, strays beside it; but no old vine among young ones, nor a post no taller than vines."""
-    rng = np.random.default_rng(0)
-    young = [np.column_stack([rng.uniform(-0.15, 0.15, 300), rng.uniform(0.15, 0.7, 300)]) for _ in range(40)]
-    post = np.column_stack([rng.normal(0.05, 0.03, 200), rng.uniform(0.2, 2.0, 200)])
-    old = np.column_stack([rng.uniform(-0.3, 0.3, 300), rng.uniform(0.2, 1.8, 300)])
-    strays = np.array([[-0.2, 1.2], [0.2, 1.5], [0.2, 1.6]])
-    posts = [np.concatenate([young[0], post]), np.concatenate([young[1], post[:12], strays])]
-    (canopy,) = separate(many_sections([*young, *posts, old]))
-    top = np.maximum.reduceat(canopy.sections.points[:, 1], canopy.sections.start[:-1])
-    np.testing.assert_allclose(top, [*[0.7] * 42, 1.8], atol=0.05)
-    tall = young[0] * [1, 2.6]
-    (canopy,) = separate(many_sections([tall] * 20 + [np.concatenate([tall, post])]))
-    assert canopy.sections.points[:, 1].max() == pytest.approx(2.0, abs=0.05)
