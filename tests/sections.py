@@ -12,7 +12,7 @@ def separate(sections):
 
 
 def one_section(points, heights=None):
-    points = np.asarray(points, dtype=float)
+    points = np.asarray(points, dtype=np.float32)
     one = np.ones(1)
     start = np.array([0, len(points)])
     return Sections(
@@ -23,8 +23,8 @@ def one_section(points, heights=None):
         2.5 * one,
         start,
         points,
-        points[:, 1] if heights is None else heights,
-        np.arange(len(points)),
+        points[:, 1].copy() if heights is None else heights,
+        np.arange(len(points), dtype=np.int32),
     )
 
 
@@ -32,9 +32,9 @@ def many_sections(points, *, spacing=2.5, step=0.25, member=None):
     """Sections of one row with the points of each, on flat soil."""
     m = len(points)
     start = np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64)
-    flat = np.concatenate(points) if m else np.empty((0, 2))
+    flat = np.concatenate(points).astype(np.float32) if m else np.empty((0, 2), dtype=np.float32)
     way = np.tile([1.0, 0], (m, 1))
     position = step * np.arange(m)
     origin = np.column_stack([position, np.zeros((m, 2))])
-    member = np.arange(len(flat)) if member is None else np.concatenate(member)
-    return Sections(np.ones(m, int), position, origin, way, np.full(m, spacing), start, flat, flat[:, 1], member)
+    member = np.arange(len(flat), dtype=np.int32) if member is None else np.concatenate(member)
+    return Sections(np.ones(m, int), position, origin, way, np.full(m, spacing), start, flat, flat[:, 1].copy(), member)
