@@ -17,7 +17,10 @@ from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers
 from vinemap.odometry.poses import STILL, moved
-from vinemap.odometry.sensors import Odometer, check_times, pulled, read_places, read_wheels
+from vinemap.odometry.sensors.files import check_times
+from vinemap.odometry.sensors.places import read_places
+from vinemap.odometry.sensors.pulling import pulled
+from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow
 from vinemap.product.geopackage import write_geopackage
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
     from vinemap.config.drives import Start
     from vinemap.odometry.frames import Frame
     from vinemap.odometry.refinement import Method
-    from vinemap.odometry.sensors import Wheels
+    from vinemap.odometry.sensors.wheels import Wheels
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
 

@@ -107,7 +107,7 @@ def follow(
         it, that is known after the first :data:`vinemap.odometry.field.FEWEST` of different ground.
     sensor : Sensor, optional
         By it a pose is carried on, where it knows, and a pattern's places are told apart:
-        :class:`vinemap.odometry.sensors.Odometer`.
+        :class:`vinemap.odometry.sensors.wheels.Odometer`.
 
     Raises
     ------

@@ -10,7 +10,9 @@ import numpy as np
 from vinemap.measure.odometry.trials import path, views
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
-from vinemap.odometry.sensors import Odometer, Places, Wheels, pulled
+from vinemap.odometry.sensors.places import Places
+from vinemap.odometry.sensors.pulling import pulled
+from vinemap.odometry.sensors.wheels import Odometer, Wheels
 from vinemap.odometry.track import follow
 from vinemap.simulate.camera import LOW
 

@@ -1,0 +1,155 @@
+"""A track that is pulled to satellite fixes by least squares.
+
+A pose graph solved by Gauss–Newton with sparse factors: G. Grisetti and others, A tutorial on graph-based SLAM, IEEE
+Intelligent Transportation Systems Magazine 2, 2010.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import splu
+
+from vinemap.odometry.poses import Pose, moved
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from scipy.sparse import csc_matrix
+
+    from vinemap.compute.arrays import Values
+    from vinemap.odometry.sensors.places import Places
+    from vinemap.odometry.track import Fix
+
+START_MM, START_DEG = 1000.0, 10.0
+"""Standard deviations of a start where fixes know better."""
+FAR = 4.0
+"""Standard deviations from the track from which on a fix is left out."""
+BLOCK = 300
+"""Columns of the inverse that are solved for at once."""
+
+
+def pulled(fixes: Sequence[Fix], places: Places) -> tuple[list[Fix], int]:
+    """A track with the poses and covariances that fit steps and places best, and how many places were left out.
+
+    Places that lie far from where all others put the robot don't count, nor those beside the recording.
+    """
+    poses = np.array([fix.pose for fix in fixes])
+    poses[:, 2] = np.radians(poses[:, 2])
+    at, weight, used = _frames_at(places, fixes)
+    unit = np.array([1, 1, np.radians(1)])
+    start = np.arange(len(fixes)) - 1
+    ends = [(start[k] if fix.measured_from is None else fix.measured_from, k) for k, fix in enumerate(fixes)][1:]
+    links = np.array(ends, int).reshape(-1, 2)
+    steps = [fixes[j].motion.movement if fixes[j].motion else moved(fixes[i].pose, fixes[j].pose) for i, j in links]
+    sure = [np.linalg.cholesky(np.linalg.inv(unit[:, None] * fixes[j].of_step * unit)).T for _, j in links]
+    graph = _Graph(links, np.array(steps).reshape(-1, 3) * unit, np.array(sure).reshape(-1, 3, 3), at, weight)
+    way = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
+    kept = used & (np.hypot(*places.xy.T) < 2 * way + FAR * (START_MM + places.sd))
+    at_first = poses
+    for _ in range(int(used.sum()) + 1):
+        poses, factors = _solved(at_first, graph, places, kept)
+        off = np.hypot(*(_place_at(poses, at, weight) - places.xy).T) / places.sd
+        worst = int(np.argmax(np.where(kept, off, 0)))
+        if not kept[worst] or off[worst] <= FAR or kept.sum() <= 1:
+            break
+        kept[worst] = False
+    covariances = factors.blocks() / unit[:, None] / unit
+    poses[:, 2] = np.degrees(poses[:, 2])
+    out = [
+        fix._replace(pose=Pose(*map(float, pose)), covariance=covariance)
+        for fix, pose, covariance in zip(fixes, poses, covariances, strict=True)
+    ]
+    return out, int(len(kept) - kept.sum())
+
+
+class _Graph(NamedTuple):
+    """Steps (n, 3) from poses to others (n, 2), square roots of their information; frames at places, and shares."""
+
+    links: Values
+    steps: Values
+    sure: Values
+    frames: Values
+    weight: Values
+
+
+def _frames_at(places: Places, fixes: Sequence[Fix]) -> tuple[Values, Values, Values]:
+    """The frame before each place in time, how far it is on to the next, and whether there are both."""
+    told = np.array([k for k, fix in enumerate(fixes) if fix.time is not None])
+    times = np.maximum.accumulate([fixes[k].time for k in told])
+    after = np.clip(np.searchsorted(times, places.times, "right"), 1, len(times) - 1)
+    share = (places.times - times[after - 1]) / np.maximum(times[after] - times[after - 1], 1e-9)
+    period = float(np.median(np.diff(times))) or 1.0
+    near = (places.times >= times[0] - period) & (places.times <= times[-1] + period)
+    return np.column_stack([told[after - 1], told[after]]), np.clip(share, 0, 1), near
+
+
+def _place_at(poses: Values, at: Values, weight: Values) -> Values:
+    return poses[at[:, 0], :2] * (1 - weight[:, None]) + poses[at[:, 1], :2] * weight[:, None]
+
+
+def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple[Values, _Factors]:
+    """Poses by Gauss–Newton, and the factors there."""
+    poses = poses.copy()
+    first = poses[0].copy()
+    prior = np.array([1 / START_MM, 1 / START_MM, 1 / np.radians(START_DEG)])
+    i, j = graph.links.T
+    for _ in range(10):
+        c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+        d = poses[j] - poses[i]
+        ahead, left = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
+        off = np.column_stack([ahead, left, d[:, 2]]) - graph.steps
+        of_j, of_i = np.zeros((2, len(i), 3, 3))
+        of_j[:, 0, 0], of_j[:, 0, 1], of_j[:, 1, 0], of_j[:, 1, 1], of_j[:, 2, 2] = c, s, -s, c, 1
+        of_i[:] = -of_j
+        of_i[:, 0, 2], of_i[:, 1, 2] = left, -ahead
+        n = len(i)
+        rows = np.repeat(np.arange(3 * n).reshape(n, 3), 3, axis=1).reshape(-1)
+        entries = [
+            (rows, np.tile(3 * ends[:, None] + np.arange(3), 3).reshape(-1), (graph.sure @ part).reshape(-1))
+            for ends, part in ((i, of_i), (j, of_j))
+        ]
+        entries.append((3 * n + np.arange(3), np.arange(3), prior))
+        at, weight = graph.frames[kept], graph.weight[kept]
+        under = 3 * n + 3 + np.arange(2 * len(at))
+        entries += [
+            (under, (3 * at[:, [end]] + np.arange(2)).reshape(-1), np.repeat(part / places.sd[kept], 2))
+            for end, part in ((0, 1 - weight), (1, weight))
+        ]
+        row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+        slopes = coo_matrix((value, (row, column)), shape=(3 * n + 3 + 2 * len(at), poses.size)).tocsc()
+        misses = (_place_at(poses, at, weight) - places.xy[kept]) / places.sd[kept, None]
+        of_steps = np.einsum("nij,nj->ni", graph.sure, off).reshape(-1)
+        residuals = np.concatenate([of_steps, prior * (poses[0] - first), misses.reshape(-1)])
+        factors = _Factors((slopes.T @ slopes).tocsc())
+        step = factors.solve((slopes.T @ residuals)[:, None])
+        poses -= step.reshape(-1, 3)
+        if np.abs(step).max() < 1e-6:
+            break
+    return poses, factors
+
+
+class _Factors:
+    """Factors of a normal matrix, its unknowns scaled alike."""
+
+    def __init__(self, normal: csc_matrix) -> None:
+        self.scale = 1 / np.sqrt(normal.diagonal())
+        self.factors = splu((diags(self.scale) @ normal @ diags(self.scale)).tocsc())
+
+    def solve(self, right: Values) -> Values:
+        """Unknowns (n, m) of right sides (n, m)."""
+        return np.asarray(self.scale[:, None] * self.factors.solve(self.scale[:, None] * right))
+
+    def blocks(self) -> Values:
+        """The (3, 3) on the diagonal of the inverse, for each pose."""
+        size = len(self.scale)
+        out = []
+        for begin in range(0, size, BLOCK):
+            width = min(BLOCK, size - begin)
+            columns = np.zeros((size, width))
+            columns[begin + np.arange(width), np.arange(width)] = 1
+            part = self.solve(columns)[begin : begin + width].reshape(width // 3, 3, width // 3, 3)
+            out.append(np.einsum("kikj->kij", part))
+        return np.concatenate(out)
