@@ -181,14 +181,14 @@ def test_wheels_tell_the_way_nearly():
 def test_lost_stretches_are_bridged(monkeypatch):
     monkeypatch.setattr("vinemap.measure.odometry.bridges.STRETCHES", 1)
     found = bridges(["gravel"], 1, length_mm=2000.0, seed=4)
-    assert found["wheels"].end[0] < 0.5 * found["nothing"].end[0]
+    assert found["wheels"].end[0] < 0.5 * found["the last movement"].end[0]
     assert found["fixes at both ends"].end[0] < 60  # three standard deviations of a fix
-    assert found["nothing"].length == pytest.approx(2.0, rel=0.05)
+    assert found["the last movement"].length == pytest.approx(2.0, rel=0.05)
 
 
 def test_bridges_are_held_against_their_bars():
     worst, end = np.array([40.0, 60.0]), np.array([50.0, 100.0])
-    names = "nothing", "wheels", "wheels, fixes at both ends"
+    names = "the last movement", "wheels", "wheels, fixes at both ends"
     lines = bridge_table({name: Bridge(worst, end, 8.0) for name in names})
     assert [line[1:] for line in lines[1:]] == [
         ["0.94, 1.25", "0.050, 0.060"],

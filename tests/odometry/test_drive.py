@@ -17,7 +17,7 @@ from vinemap.config.drives import Start
 from vinemap.errors import InputError, OutputError
 from vinemap.odometry.drive import map_drive
 from vinemap.odometry.layers import TRACK_LAYERS
-from vinemap.odometry.poses import moved
+from vinemap.odometry.poses import Pose, moved
 from vinemap.simulate.camera import LOW
 
 N = 12
@@ -155,6 +155,19 @@ def test_other_sensors_go_along(recording, robot, tmp_path):
     ]:
         with pytest.raises(InputError, match=says):
             map_drive([recording], out, camera=LOW, **{"start": START} | options)
+
+
+def test_a_gap_is_crossed_by_what_lies_behind_it_too(tmp_path):
+    robot = [Pose(-1600 + 25 * k + 0.5 * k**2, 0.0, 0.0) for k in range(32)]  # it goes faster and faster
+    for k, image in enumerate(images(robot)):
+        lost = 12 <= k < 18
+        cv2.imwrite(str(tmp_path / f"{1778745600 + k / 4:.2f}.png"), np.zeros_like(image) if lost else image)
+    summary = map_drive([tmp_path], tmp_path / "track.gpkg", camera=LOW, start=START)
+    assert (summary.n_stretches, summary.flags["blank"]) == (2, 6)
+    found = gpd.read_file(tmp_path / "track.gpkg", layer="poses")
+    way = np.hypot(found["x_m"], found["y_m"]).to_numpy()
+    assert way[[11, 15, 18, 31]] == pytest.approx([(robot[k].x_mm + 1600) / 1000 for k in (11, 15, 18, 31)], abs=0.003)
+    assert found["sd_m"][18] < 0.02
 
 
 def test_lost_steps_break_the_line_and_are_told(recording, tmp_path):

@@ -96,7 +96,7 @@ def test_wheels_bridge_a_lost_stretch():
 def test_fixes_pull_the_track_to_where_they_are():
     fixes, true = track(lost={10, 11, 12, 13})
     ends = np.array([true[0][:2], true[-1][:2]])
-    found, left_out = pulled(fixes, Places(np.array([0.0, 29 * 0.2]), ends, np.array([20.0, 20.0])))
+    found, left_out, _ = pulled(fixes, Places(np.array([0.0, 29 * 0.2]), ends, np.array([20.0, 20.0])))
     assert left_out == 0
     assert off(found, true)[-1] < 10 < off(fixes, true)[-1]
     assert off(found, true).max() < off(fixes, true).max()
@@ -110,7 +110,7 @@ def test_the_covariance_of_a_pulled_track_is_that_of_its_errors():
         fixes, true = track(20, lost={8, 9}, seed=seed)
         rng = np.random.default_rng(seed)
         ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, 20, (2, 2))
-        found, _ = pulled(fixes, Places(np.array([0.0, 19 * 0.2]), ends, np.array([20.0, 20.0])))
+        found = pulled(fixes, Places(np.array([0.0, 19 * 0.2]), ends, np.array([20.0, 20.0]))).fixes
         e = np.array(found[9].pose[:2]) - true[9][:2]
         z.append(e @ np.linalg.solve(found[9].covariance[:2, :2], e))
     assert 1.4 < np.mean(z) < 2.7  # 2 expected, 95% of 80 degrees of freedom
@@ -120,7 +120,7 @@ def test_a_track_that_begins_with_bad_frames_is_pulled_too():
     shots = [frame._replace(time=k / 10) for k, frame in enumerate(frames([None, None, *images(poses(14))[:4]]))]
     fixes = list(follow(iter(shots), camera=LOW))
     assert [fix.covariance.any() for fix in fixes[2:]] == [False, True, True, True]
-    found, _ = pulled(fixes, Places(np.array([0.5]), np.array([[300.0, 0.0]]), np.array([10.0])))
+    found = pulled(fixes, Places(np.array([0.5]), np.array([[300.0, 0.0]]), np.array([10.0]))).fixes
     assert found[-1].pose.x_mm == pytest.approx(300, abs=5)
     assert all(np.linalg.eigvalsh(fix.covariance)[0] > 0 for fix in found)
 
@@ -130,10 +130,10 @@ def test_a_fix_far_off_is_left_out():
     at = np.array([0, 10, 20, 29])
     xy = np.array([true[k][:2] for k in at])
     xy[2] += 5000
-    found, left_out = pulled(fixes, Places(at * 0.2, xy, np.full(4, 20.0)))
+    found, left_out, _ = pulled(fixes, Places(at * 0.2, xy, np.full(4, 20.0)))
     assert left_out == 1
     assert off(found, true).max() < 10
-    assert pulled(fixes, Places(np.array([0.0, 900.0]), xy[:2], np.full(2, 20.0)))[1] == 1
+    assert pulled(fixes, Places(np.array([0.0, 900.0]), xy[:2], np.full(2, 20.0))).left_out == 1
 
 
 def test_places_are_in_the_frame_of_the_start(tmp_path):

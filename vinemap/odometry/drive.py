@@ -17,9 +17,9 @@ from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers
 from vinemap.odometry.poses import STILL, moved
+from vinemap.odometry.sensors.bridging import bridged, joined
 from vinemap.odometry.sensors.files import check_times
 from vinemap.odometry.sensors.places import read_places
-from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow
@@ -132,6 +132,7 @@ def map_drive(
     wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
     known, odd_places = read_places(places, start) if places and start else (None, 0)
     crs = _crs_of(start, lines)
+    odometer = Odometer(wheels) if wheels else None
     source = read_recording(recording, camera=camera)
 
     def followed() -> list[Fix]:
@@ -143,7 +144,7 @@ def map_drive(
             angles=angles,
             method=method,
             foresight=MEMORY,
-            sensor=Odometer(wheels) if wheels else None,
+            sensor=odometer,
         )
         return list(told)
 
@@ -167,8 +168,11 @@ def map_drive(
         )
     if places and known:
         check_times(places, known.times, fixes)
-        fixes, far = step(STAGES[1], pulled, fixes, known)
+        fixes, far, fit = step(STAGES[1], joined, fixes, known, odometer)
         remarks += [f"{odd_places + far} of {odd_places + len(known.sd)} fixes left out"] * (odd_places + far > 0)
+        remarks += ["fixes contradict the track by more than both err"] * (not fit)
+    else:
+        fixes = bridged(fixes, odometer)
     layers = step(STAGES[1], placed, fixes)
     step(STAGES[2], _write, layers, out)
     flags = [fix.flag for fix in fixes if fix.flag]

@@ -10,8 +10,8 @@ import numpy as np
 from vinemap.measure.odometry.trials import path, views
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
+from vinemap.odometry.sensors.bridging import bridged, joined
 from vinemap.odometry.sensors.places import Places
-from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, Wheels
 from vinemap.odometry.track import follow
 from vinemap.simulate.camera import LOW
@@ -65,10 +65,11 @@ def bridges(
         places = Places(times[[0, -1]], ends, np.full(2, ACCURACY))
         alone, driven = (list(follow(iter(frames), camera=LOW, sensor=sensor)) for sensor in (None, odometer))
         tracks = {
-            "nothing": alone,
-            "wheels": driven,
-            "fixes at both ends": pulled(alone, places)[0],
-            "wheels, fixes at both ends": pulled(driven, places)[0],
+            "the last movement": alone,
+            "steps beside them": bridged(alone),
+            "wheels": bridged(driven, odometer),
+            "fixes at both ends": joined(alone, places).fixes,
+            "wheels, fixes at both ends": joined(driven, places, odometer).fixes,
         }
         for name, track in tracks.items():
             found.setdefault(name, []).append(_off(track, true))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
+from scipy.stats import chi2
 
 from vinemap.odometry.poses import Pose, moved
 
@@ -27,12 +28,24 @@ START_MM, START_DEG = 1000.0, 10.0
 """Standard deviations of a start where fixes know better."""
 FAR = 4.0
 """Standard deviations from the track from which on a fix is left out."""
+LIKELY = 0.999
+"""Probability of an error that is no larger, from which on steps and places contradict each other."""
 BLOCK = 300
 """Columns of the inverse that are solved for at once."""
 
 
-def pulled(fixes: Sequence[Fix], places: Places) -> tuple[list[Fix], int]:
-    """A track with the poses and covariances that fit steps and places best, and how many places were left out.
+class Pulled(NamedTuple):
+    """A track that was pulled to places."""
+
+    fixes: list[Fix]
+    left_out: int
+    """Places that don't count."""
+    fits: bool
+    """Whether steps and places contradict each other no more than they err by what is said of them."""
+
+
+def pulled(fixes: Sequence[Fix], places: Places) -> Pulled:
+    """A track with the poses and covariances that fit steps and places best.
 
     Places that lie far from where all others put the robot don't count, nor those beside the recording.
     """
@@ -50,7 +63,7 @@ def pulled(fixes: Sequence[Fix], places: Places) -> tuple[list[Fix], int]:
     kept = used & (np.hypot(*places.xy.T) < 2 * way + FAR * (START_MM + places.sd))
     at_first = poses
     for _ in range(int(used.sum()) + 1):
-        poses, factors = _solved(at_first, graph, places, kept)
+        poses, factors, misfit = _solved(at_first, graph, places, kept)
         off = np.hypot(*(_place_at(poses, at, weight) - places.xy).T) / places.sd
         worst = int(np.argmax(np.where(kept, off, 0)))
         if not kept[worst] or off[worst] <= FAR or kept.sum() <= 1:
@@ -62,7 +75,8 @@ def pulled(fixes: Sequence[Fix], places: Places) -> tuple[list[Fix], int]:
         fix._replace(pose=Pose(*map(float, pose)), covariance=covariance)
         for fix, pose, covariance in zip(fixes, poses, covariances, strict=True)
     ]
-    return out, int(len(kept) - kept.sum())
+    likely = 2 * kept.sum() == 0 or misfit <= chi2.ppf(LIKELY, 2 * kept.sum())
+    return Pulled(out, int(len(kept) - kept.sum()), bool(likely))
 
 
 class _Graph(NamedTuple):
@@ -90,8 +104,8 @@ def _place_at(poses: Values, at: Values, weight: Values) -> Values:
     return poses[at[:, 0], :2] * (1 - weight[:, None]) + poses[at[:, 1], :2] * weight[:, None]
 
 
-def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple[Values, _Factors]:
-    """Poses by Gauss–Newton, and the factors there."""
+def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple[Values, _Factors, float]:
+    """Poses by Gauss–Newton, the factors there, and what is left of all squared errors over their variances."""
     poses = poses.copy()
     first = poses[0].copy()
     prior = np.array([1 / START_MM, 1 / START_MM, 1 / np.radians(START_DEG)])
@@ -128,7 +142,7 @@ def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple
         poses -= step.reshape(-1, 3)
         if np.abs(step).max() < 1e-6:
             break
-    return poses, factors
+    return poses, factors, float(residuals @ residuals)
 
 
 class _Factors:

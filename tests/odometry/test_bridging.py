@@ -1,0 +1,152 @@
+"""Gaps between stretches of a track: what crosses them, how sure that is, and what contradicts it."""
+
+import numpy as np
+import pytest
+
+from vinemap.odometry.poses import STILL, Pose, moved, onward, onward_covariance
+from vinemap.odometry.sensors.bridging import bridged, joined
+from vinemap.odometry.sensors.places import Places
+from vinemap.odometry.sensors.pulling import pulled
+from vinemap.odometry.sensors.wheels import Odometer, Wheels
+from vinemap.odometry.step import Motion
+from vinemap.odometry.track import Fix, stretches
+
+PERIOD = 0.2
+MEASURED, GUESSED = np.diag([0.1**2, 0.1**2, 0.02**2]), np.diag([35.0**2, 35.0**2, 3.0**2])
+GAP = range(60, 70)
+
+
+def bends(n=140, *, seed=0):
+    """Steps of a robot whose turns rise and fall, and whose speed wavers a bit."""
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0, 2 * np.pi)
+    turns = 3 * np.sin(2 * np.pi * np.arange(n) / 50 + phase)
+    return [Pose(60 + rng.normal(0, 0.5), 0.0, turn) for turn in turns]
+
+
+def track(steps, lost=GAP, *, flag="blank", seed=0):
+    """A track whose measured steps err as they say, carried on by the last one where frames are lost; and the truth."""
+    rng = np.random.default_rng(seed)
+    fixes, true = [Fix("0", 0.0, STILL, np.zeros((3, 3)), MEASURED, 245.0)], [STILL]
+    last = steps[0]
+    for k, step in enumerate(steps[1:], start=1):
+        alone = k in lost or k - 1 in lost
+        of_step = GUESSED if alone else MEASURED
+        last = last if alone else Pose(*map(float, rng.multivariate_normal(step, of_step)))
+        before = fixes[-1]
+        why = flag if k in lost else "score" if alone else ""
+        covariance = onward_covariance(before.pose, before.covariance, last, of_step)
+        fix = Fix(str(k), PERIOD * k, onward(before.pose, last), covariance, of_step, 245.0, why)
+        fixes.append(fix if alone else fix._replace(measured_from=k - 1, motion=Motion(*last, of_step)))
+        true.append(onward(true[-1], step))
+    return fixes, true
+
+
+def wheels_of(steps, *, speed=1.0, rate=1.0):
+    """An odometer of such a robot, which has learned of its frames."""
+    values = np.array([*steps, steps[-1]])
+    speeds, rates = (np.repeat(values[1:, c] / PERIOD, 2) for c in (0, 2))
+    edges = np.repeat(PERIOD * np.arange(len(values)), 2)[1:-1] + np.tile([1e-6, -1e-6], len(values) - 1)
+    return Odometer(Wheels(edges, speed * speeds, rate * rates))
+
+
+def off(fixes, true):
+    return np.array([np.hypot(*np.subtract(f.pose[:2], t[:2])) for f, t in zip(fixes, true, strict=True)])
+
+
+def crossed(fixes):
+    """The movement across the gap."""
+    return moved(fixes[GAP[0] - 1].pose, fixes[GAP[-1] + 1].pose)
+
+
+def test_a_gap_is_crossed_by_the_steps_beside_it():
+    fixes, true = track(bends())
+    found = bridged(fixes)
+    assert off(fixes, true).max() > 300
+    assert off(found, true).max() < 60
+    assert [fix.flag for fix in found] == [fix.flag for fix in fixes]
+    assert stretches(found) == stretches(fixes)
+    measured = [k for k in range(1, 140) if fixes[k].motion]
+    for k in measured:
+        assert moved(found[k - 1].pose, found[k].pose) == pytest.approx(fixes[k].motion.movement, abs=1e-6)
+
+
+def test_it_is_as_sure_as_it_errs():
+    z = []
+    for seed in range(40):
+        fixes, true = track(bends(seed=seed), seed=seed)
+        found = bridged(fixes)
+        k = GAP[-1] + 1
+        z.append((found[k].pose.heading_deg - true[k].heading_deg) ** 2 / found[k].covariance[2, 2])
+    assert 0.4 < np.mean(z) < 1.8
+
+
+def test_wheels_cross_what_steps_beside_a_gap_dont_show():
+    steps = [
+        Pose(0.0, 0.0, 0.0) if k in range(62, 69) or k in range(20, 27) else step for k, step in enumerate(bends())
+    ]
+    fixes, true = track(steps)
+    alone, driven = bridged(fixes), bridged(fixes, wheels_of(steps))
+    assert off(alone, true).max() > 200
+    assert off(driven, true).max() < 20
+    assert driven[70].covariance[0, 0] < alone[70].covariance[0, 0]
+
+
+def test_wheels_without_yaw_rates_leave_the_turn_to_the_steps_beside():
+    steps = bends()
+    fixes, true = track(steps)
+    found = bridged(fixes, wheels_of(steps, rate=np.nan))
+    way, truth = crossed(found), moved(true[59], true[70])
+    assert way.heading_deg == pytest.approx(truth.heading_deg, abs=3)
+    assert way.heading_deg == pytest.approx(crossed(bridged(fixes)).heading_deg, abs=1e-9)
+    assert way.x_mm == pytest.approx(truth.x_mm, abs=5)
+
+
+def test_a_gap_of_the_robots_own_making_is_no_surer_than_a_guess():
+    fixes, _ = track(bends(), flag="score")
+    found = bridged(fixes)
+    assert crossed(found) != pytest.approx(crossed(fixes), abs=1)
+    assert all(np.diag(found[k].of_step) == pytest.approx(np.diag(GUESSED)) for k in GAP)
+
+
+def test_what_compares_with_nothing_stays():
+    fixes, _ = track(bends(), lost=range(6, 134))
+    assert [fix.pose for fix in bridged(fixes)] == [fix.pose for fix in fixes]
+
+
+def test_a_track_without_gaps_stays():
+    fixes, _ = track(bends(), lost=())
+    assert [fix.pose for fix in bridged(fixes)] == [fix.pose for fix in fixes]
+
+
+def test_images_without_times_are_bridged_frame_by_frame():
+    fixes, _ = track(bends())
+    timeless = [fix._replace(time=None) for fix in fixes]
+    assert crossed(bridged(timeless)) == pytest.approx(crossed(bridged(fixes)), abs=1e-6)
+
+
+def test_frames_that_a_recorder_dropped_count_by_their_time():
+    straight = [Pose(60.0, 0.0, 0.0)] * 140
+    fixes, true = track(straight)
+    late = [fix._replace(time=fix.time + 1.0 * (k > 65)) for k, fix in enumerate(fixes)]  # five more steps
+    assert crossed(bridged(late)).x_mm == pytest.approx(16 * 60, abs=3)
+    assert crossed(bridged(fixes)).x_mm == pytest.approx(moved(true[59], true[70]).x_mm, abs=3)
+
+
+def test_places_that_contradict_what_bridges_a_gap_have_it_their_way():
+    steps = [Pose(0.0, 0.0, 0.0) if k in range(62, 69) else step for k, step in enumerate(bends())]
+    fixes, true = track(steps)
+    at = np.linspace(0, 139, 8).astype(int)
+    places = Places(PERIOD * at, np.array([true[k][:2] for k in at]), np.full(8, 20.0))
+    assert not pulled(bridged(fixes), places).fits or pulled(bridged(fixes), places).left_out
+    found = joined(fixes, places)
+    assert (found.left_out, found.fits) == (0, True)
+    assert off(found.fixes, true)[at].max() < 30
+
+
+def test_places_at_both_ends_hold_a_bridged_track():
+    fixes, true = track(bends())
+    places = Places(np.array([0.0, 139 * PERIOD]), np.array([true[0][:2], true[-1][:2]]), np.full(2, 20.0))
+    found = joined(fixes, places)
+    assert off(found.fixes, true).max() < 30 < off(pulled(fixes, places).fixes, true).max()
+    assert found.fits

@@ -1,0 +1,178 @@
+"""Gaps of a track that no frame tells, crossed by what the whole of a recording knows.
+
+On its way a robot knows what came before a gap. Afterwards more is known: the steps behind it, and wheels that were
+held against all other frames. How far each is to be believed is measured by the recording itself, over stretches as
+long that frames do tell.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise, takewhile
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.interpolate import make_interp_spline
+
+from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
+from vinemap.odometry.sensors.pulling import Pulled, pulled
+from vinemap.odometry.track import stretches
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from vinemap.compute.arrays import Ints, Values
+    from vinemap.odometry.sensors.places import Places
+    from vinemap.odometry.sensors.wheels import Odometer
+    from vinemap.odometry.track import Fix
+
+AROUND = 4
+"""Steps at either side of a gap, at most, that tell those within."""
+DEGREES = (1, 3)
+"""Of splines through them."""
+WINDOWS = 1000
+"""Stretches as long as a gap that it is held against, at most: the nearest."""
+UNSEEN = frozenset({"unreadable", "size", "repeated", "blank"})
+"""Flags of frames that were lost whatever the robot did meanwhile."""
+
+
+class _Known(NamedTuple):
+    """What a recording tells of the steps (n, 3) to its frames from those before, NaN where it doesn't."""
+
+    seen: Values
+    """By frames."""
+    driven: Values
+    """By wheels."""
+    seconds: Values
+    """That they took (n,); 1 where there are no times."""
+
+
+def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]:
+    """A track whose stretches are joined by the likeliest steps across the gaps between them.
+
+    Each part of a step, ahead, to the left and its turn, is that of wheels, or of a spline through the steps beside the
+    gap: of what comes closest to frames over stretches as long that they do tell, and as sure as that. A gap that may
+    come of the robot's own movement is no surer than a guess, as nothing like that was seen. What compares with no
+    other stretch is left as it was. Flags stay.
+
+    Parameters
+    ----------
+    fixes : sequence of Fix
+        Of a whole recording, as :func:`vinemap.odometry.track.follow` tells them.
+    odometer : Odometer, optional
+        The sensor of that, which has learned of all frames.
+    """
+    known = _known(fixes, odometer)
+    joined = [(k, number) for k, number in enumerate(stretches(fixes)) if number]
+    measured = [np.diag(fix.of_step) for fix in fixes if fix.motion] or [np.zeros(3)]
+    surest = np.median(measured, axis=0)
+    steps: dict[int, tuple[Pose, Values]] = {}
+    for (before, stretch), (after, next_stretch) in pairwise(joined):
+        found = _crossing(known, before, after) if stretch != next_stretch else None
+        if found is None:
+            continue
+        lost = after - before > 1 and all(fix.flag in UNSEEN for fix in fixes[before + 1 : after])
+        told, variance = found
+        for k, step in enumerate(told, start=before + 1):
+            least = surest if lost else np.diag(fixes[k].of_step)
+            steps[k] = Pose(*map(float, step)), np.diag(np.maximum(variance, least))
+    return _carried(fixes, steps)
+
+
+def joined(fixes: Sequence[Fix], places: Places, odometer: Odometer | None = None) -> Pulled:
+    """A track that is bridged and pulled to places, or pulled as it was where they contradict what bridges it.
+
+    Parameters are as of :func:`bridged` and :func:`vinemap.odometry.sensors.pulling.pulled`.
+    """
+    found = pulled(bridged(fixes, odometer), places)
+    if found.fits and not found.left_out:
+        return found
+    return min(found, pulled(fixes, places), key=lambda track: (track.left_out, not track.fits))
+
+
+def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
+    number = stretches(fixes)
+    seen, driven = np.full((2, len(fixes), 3), np.nan)
+    seconds = np.full(len(fixes), np.nan)
+    for k, (before, fix) in enumerate(pairwise(fixes), start=1):
+        step = moved(before.pose, fix.pose)
+        if number[k] and number[k] == number[k - 1]:
+            seen[k] = step
+        if fix.time is not None and before.time is not None:
+            seconds[k] = fix.time - before.time
+        found = odometer.between(before.time, fix.time, step) if odometer else None
+        if odometer and found:
+            driven[k] = np.where(odometer.told, found[0], np.nan)
+    timed = (seconds[1:] > 0).all()
+    return _Known(seen, driven, seconds if timed else np.ones(len(fixes)))
+
+
+def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] | None:
+    """The steps to the frames behind one and up to another (n, 3), and the variance (3,) of each."""
+    inside = np.arange(1, after - before + 1)
+    for around in range(AROUND, 0, -1):
+        beside = _beside(known.seen, before, after, around)
+        alike = _alike(known.seen, before, inside, beside)
+        if len(alike):
+            break
+    at = np.append(alike, before)[:, None]
+    ways = [known.driven[at + inside]]
+    if beside.min(initial=1) < inside[0] and beside.max(initial=0) > inside[-1]:
+        speeds = known.seen[at + beside] / known.seconds[at + beside, None]
+        ways += [
+            (make_interp_spline(beside, np.eye(len(beside)), k=degree)(inside) @ speeds)
+            * known.seconds[at + inside, None]
+            for degree in DEGREES
+            if degree < len(beside)
+        ]
+    told = np.array(ways)
+    off = np.sum(told[:, :-1] - known.seen[at[:-1] + inside], axis=2)
+    spread = np.full((len(ways), 3), np.inf)
+    for k, errors in enumerate(off):
+        compared = ~np.isnan(errors)
+        np.divide(np.nansum(errors**2, axis=0), compared.sum(axis=0), out=spread[k], where=compared.any(axis=0))
+    spread[np.isnan(told[:, -1]).any(axis=1)] = np.inf
+    best = np.argmin(spread, axis=0)
+    variance = spread[best, range(3)]
+    if not np.isfinite(variance).all():
+        return None
+    few = 1 + 2 / max(len(alike) / len(inside), 1)  # as Student's distribution is wider
+    return told[best, -1, :, range(3)].T, variance * few / len(inside)
+
+
+def _beside(seen: Values, before: int, after: int, around: int) -> Ints:
+    """The steps nearest to a gap that frames tell without a break, by how far on from the frame before it they are."""
+    found = []
+    for first, way in ((before, -1), (after + 1, 1)):
+        steps = range(first, first + way * around, way)
+        found += list(takewhile(lambda k: 0 <= k < len(seen) and not np.isnan(seen[k, 0]), steps))
+    return np.sort(np.array(found, int)) - before
+
+
+def _alike(seen: Values, before: int, inside: Ints, beside: Ints) -> Ints:
+    """The frames (n,) nearest to the one before a gap from which all steps like those in and beside it are told."""
+    steps = np.concatenate([inside, beside])
+    first, last = 1 - steps.min(), len(seen) - steps.max()
+    if last <= first:
+        return np.empty(0, int)
+    told = sliding_window_view(~np.isnan(seen[1:, 0]), int(np.ptp(steps)) + 1)
+    found = first + np.flatnonzero(told.all(axis=1))
+    return np.sort(found[np.argsort(np.abs(found - before), kind="stable")][:WINDOWS])
+
+
+def _carried(fixes: Sequence[Fix], steps: Mapping[int, tuple[Pose, Values]]) -> list[Fix]:
+    """The track with other steps, and covariances of them, to some of its poses from those before."""
+    out: list[Fix] = []
+    for k, fix in enumerate(fixes):
+        if fix.motion is not None and fix.measured_from is not None:
+            anchor, step, of_step = out[fix.measured_from], fix.motion.movement, fix.of_step
+        elif k in steps:
+            anchor, (step, of_step) = out[k - 1], steps[k]
+        elif steps and k > min(steps):
+            anchor, step, of_step = out[k - 1], moved(fixes[k - 1].pose, fix.pose), fix.of_step
+        else:
+            out.append(fix)
+            continue
+        pose, covariance = onward(anchor.pose, step), onward_covariance(anchor.pose, anchor.covariance, step, of_step)
+        out.append(fix._replace(pose=pose, covariance=covariance, of_step=of_step))
+    return out
