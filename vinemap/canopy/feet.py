@@ -11,14 +11,20 @@ from vinemap.compute.compiled import compiled
 
 if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
-    from vinemap.compute.arrays import Ints, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
 
-FOOT_BIN = 0.025
-"""Metres: bins of the histograms that tell the foliage's foot."""
+FOOT_BIN, HIGHEST = 0.025, 3.0
+"""Metres: bins of the histograms that tell the foliage's foot, and up to where they reach."""
 FOOT_RANKS = 0.02, 0.1
 """Orders of the heights through which the line is drawn that falls to no points at the foot."""
-FOOT_BAND, FOOT_SPREAD = 0.15, 0.8
-"""Metres above the foot whose points tell how wide the canopy stands on it, and the quantile that is its side."""
+FOOT_SIDES, FOOT_WIDTH = 0.5, 0.9
+"""Share of a canopy's half width from which on its points show its sides, and the quantile that is its half width."""
+FOOT_DEPTH, FOOT_STRAYS, FOOT_EDGE = 0.15, 3.0, 0.15
+"""Share of a canopy's depth over which sides are looked at above and below a foot, points there that may be strays, and
+the order of the heights above that is the foot."""
+FOOT_BAND, FOOT_SPREAD = 0.15, 0.5
+"""Metres above the foot whose points tell how wide the canopy stands on it, and the quantile of those of a side that is
+where it ends."""
 
 
 def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]:
@@ -39,18 +45,54 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     if m == 0:
         return canopy, np.empty((0, 3, 2))
     near = _window(canopy, pool)
-    levels = _pooled(_histograms(canopy.points[:, 1].copy(), canopy.start, 0.0, FOOT_BIN, round(3 / FOOT_BIN)), near)
-    low, high = (_rank(levels, q) * FOOT_BIN for q in FOOT_RANKS)
-    foot = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
+    foot = _foot(canopy, near)
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
     above = canopy.points[:, 1] <= np.repeat(foot + FOOT_BAND, np.diff(canopy.start))
-    # Points higher up go to a bin of their own, that doesn't count.
-    half = FOOT_BIN * math.ceil(float(np.abs(canopy.points[:, 0]).max(initial=FOOT_BIN)) / FOOT_BIN + 1)
-    across = np.where(above, canopy.points[:, 0], 2 * half)
-    widths = _pooled(_histograms(across, canopy.start, -half, FOOT_BIN, round(2 * half / FOOT_BIN) + 1)[:, :-1], near)
-    right, left = (_rank(widths, q) * FOOT_BIN - half for q in (1 - FOOT_SPREAD, FOOT_SPREAD))
-    feet = np.stack([(left + right) / 2, foot, left, foot, right, foot], axis=-1).reshape(m, 3, 2)
+    right, left = _sides(canopy, above, near)
+    feet = np.stack([(left - right) / 2, foot, left, foot, -right, foot], axis=-1).reshape(m, 3, 2)
     return canopy, feet
+
+
+def _foot(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
+    """Heights (m,) where the foliage of sections begins, told by those in each one's window.
+
+    Few of its points lie there, the fewer the wider it is and the more it hides, but next to none below: the foot is
+    where points on its sides become most times as many, from below to above, or lower, where all points thin out.
+    """
+    bins = round(HIGHEST / FOOT_BIN)
+    across, height = np.abs(canopy.points[:, 0]), canopy.points[:, 1].copy()
+    levels = _pooled(_histograms(height, canopy.start, 0.0, FOOT_BIN, bins), near)
+    half_width = _rank(_pooled(_histograms(across, canopy.start, 0.0, FOOT_BIN, bins), near), FOOT_WIDTH) * FOOT_BIN
+    middle = across < FOOT_SIDES * np.repeat(half_width, np.diff(canopy.start))
+    height = np.where(middle, HIGHEST + FOOT_BIN, height)
+    sides = _pooled(_histograms(height, canopy.start, 0.0, FOOT_BIN, bins + 1)[:, :-1], near)
+    low, high, half, top = (_rank(levels, q) for q in (*FOOT_RANKS, 0.5, 1 - FOOT_RANKS[0]))
+    thins_out = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
+    reach = FOOT_DEPTH * (top - thins_out)
+    return np.minimum(thins_out, _rise(sides, reach, half)) * FOOT_BIN
+
+
+def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
+    """How far (2, m) to the right and left sections reach at their feet, told by those in each one's window.
+
+    A side of which next to nothing was seen there is as far as the other.
+    """
+    across = canopy.points[:, 0]
+    bins = math.ceil(float(np.abs(across).max(initial=FOOT_BIN)) / FOOT_BIN) + 1
+    beyond = FOOT_BIN * (bins + 1)
+    shown = [
+        _pooled(_histograms(np.where(at_foot & (away >= 0), away, beyond), canopy.start, 0.0, FOOT_BIN, bins + 1), near)
+        for away in (-across, across)
+    ]
+    right, left = (side[:, :-1] for side in shown)
+    few = [side.sum(axis=1) <= FOOT_STRAYS for side in (right, left)]
+    both = right + left
+    return np.array(
+        [
+            _rank(np.where(one_sided[:, None], both, side), FOOT_SPREAD) * FOOT_BIN
+            for side, one_sided in zip((right, left), few, strict=True)
+        ]
+    )
 
 
 def _window(canopy: Sections, reach: float) -> tuple[Ints, Ints]:
@@ -91,4 +133,27 @@ def _rank(histograms: Values, q: float) -> Values:
             before += histograms[k, i]
             i += 1
         out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total else 0.5 * bins
+    return out
+
+
+@compiled
+def _rise(histograms: Values, reach: Values, up_to: Values) -> Values:
+    """Bin (m,), up to one, from which on histograms (m, bins) of a canopy are most times what they are below it."""
+    m, bins = histograms.shape
+    out = np.zeros(m)
+    before = np.zeros(bins + 1)
+    for k in range(m):
+        for j in range(bins):
+            before[j + 1] = before[j] + histograms[k, j]
+        away = max(int(reach[k] + 0.5), 2)
+        most, at = 0.0, 0
+        for j in range(min(int(up_to[k]), bins) + 1):
+            above, below = before[min(j + away, bins)] - before[j], before[j] - before[max(j - away, 0)]
+            rise = (above + FOOT_STRAYS) / (below + FOOT_STRAYS)
+            if rise > most:
+                most, at = rise, j
+        wanted = before[at] + FOOT_EDGE * (before[min(at + away, bins)] - before[at])
+        while at < bins - 1 and before[at + 1] < wanted:
+            at += 1
+        out[k] = at + (wanted - before[at]) / max(histograms[k, at], 1e-9)
     return out

@@ -130,8 +130,8 @@ def _model_row(canopy: Canopy, *, c: int, share: float, on_foliage: bool, least:
     reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
     outline, start, grown = grow(peeled.hull, peeled.start, feet, reach)
     model = enclose(outline, start, grown if on_foliage else canopy.soil, c=c, share=0.0, slide=on_foliage)
-    # The foot that the sections around tell may leave a young vine nothing.
-    valid = model.valid & (np.diff(sections.start) >= least)
+    # The foot that the sections around tell may leave a young vine nothing, and points on a line have no area.
+    valid = model.valid & (model.hull_area > 0) & (np.diff(sections.start) >= least)
     if not valid.all():
         sections = sections.subset(np.repeat(valid, np.diff(sections.start)), valid)
     areas = model.shared_area[valid], model.area[valid], model.hull_area[valid]
