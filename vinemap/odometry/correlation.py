@@ -5,6 +5,7 @@ J. P. Lewis, Fast normalized cross-correlation, Vision Interface 1995.
 
 from __future__ import annotations
 
+from math import cos, radians, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -69,9 +70,9 @@ def place_at(search: Search, index: Sequence[float] | Values) -> Place:
 
 def warp(angle: float, source: Sequence[float] | Values, target: Sequence[float] | Values) -> Values:
     """Matrix (2, 3) to pixels of an image from those of the next, (row, column) of a point in both given."""
-    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    turn = np.array([[c, s], [-s, c]])
-    return np.column_stack([turn, np.array(source)[::-1] - turn @ np.array(target)[::-1]])
+    c, s = cos(radians(angle)), sin(radians(angle))
+    (y, x), (next_y, next_x) = source, target
+    return np.array([[c, s, x - c * next_x - s * next_y], [-s, c, y + s * next_x - c * next_y]])
 
 
 def correlation(search: Search, box: Box) -> Values:
