@@ -223,6 +223,12 @@ def test_steps_that_do_no_harm(tmp_path, points, step):
     assert read_cloud(write(tmp_path / "a.laz", points + NAPA, crs=32610, scales=(step, step, 0.01))).size == 10_000
 
 
+def test_profiles_of_a_scanner_that_drives_along_an_axis_are_no_rounding(tmp_path, points):
+    profiles = points.copy()
+    profiles[:, 0] = 0.67 * np.rint(points[:, 0] / 0.67)
+    assert read_cloud(write(tmp_path / "a.laz", profiles + NAPA, crs=32610)).size == 10_000
+
+
 def test_two_fields_far_apart_are_no_coarse_steps(tmp_path, points):
     far = np.concatenate([points[::2], points[1::2] + [5000, 0, 0]]) + NAPA
     assert read_cloud(write(tmp_path / "a.laz", far, crs=32610, scales=0.01)).size == 10_000

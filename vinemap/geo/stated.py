@@ -50,6 +50,8 @@ FEW = 0.25
 """Share of a sample that has values of its own, below which the steps between them are those of their storage."""
 LEAST = 0.1
 """Order of the differences between values that is their step; others are some steps."""
+ALIKE = 0.1
+"""Share by which steps of eastings and northings that were rounded alike may differ."""
 DEGREE = float(np.radians(GLOBE))
 """Metres of a degree of latitude."""
 
@@ -286,8 +288,8 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> No
     areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
     apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
     sizes = [*metres, vertical_unit(crs)]
-    for axis, column, scale, size in zip("xyz", sample.T, header.scales, sizes, strict=True):
-        step = max(float(scale), _step(column))
+    for axis, shown, scale, size in zip("xyz", _shown_steps(sample), header.scales, sizes, strict=True):
+        step = max(float(scale), shown)
         if step * size > max(FINE, apart):
             lie = f"lie {apart:.2f} m apart" if apart else "all lie in one place"
             known = f"{step:g} (scale {scale:g}), {float(f'{step * size:.2g}'):g} m"
@@ -295,6 +297,17 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> No
                 f"{path}: its {axis} is stored in steps of {known}, but its points {lie}: "
                 "export the cloud anew, with a finer scale"
             )
+
+
+def _shown_steps(sample: Floats) -> list[float]:
+    """Steps (3,) in which coordinates (n, 3) were rounded before, or kept in single precision; 0 where they weren't.
+
+    A scanner that drives along an axis leaves profiles at even steps of it alone, which is no rounding.
+    """
+    x, y, z = (_step(column) for column in sample.T)
+    if not np.isclose(x, y, rtol=ALIKE):
+        x, y = (step if step > 0 and np.frexp(step)[0] == 0.5 else 0.0 for step in (x, y))
+    return [x, y, z]
 
 
 def _step(values: Floats) -> float:
