@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import time
 from datetime import UTC, datetime
+from importlib import import_module
+from threading import Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinemap import paths
@@ -132,10 +134,11 @@ def follow(
         return out
 
     with store.product(folder, drafts=drafts, within=within) as draft:
+        Thread(target=import_module, args=["vinemap.making"]).start()  # half a second that reading needn't wait for
         points: Cloud = run("Reading", _read, recipe, piece, draft)
         if origin:
             check_near(origin, points.extent[0], points.crs)
-        from vinemap.making import make_product  # half a second of start-up, for what could be read
+        from vinemap.making import make_product
         from vinemap.product.record import Summary
 
         aligned = _collector(settings, paths.tiles(draft) / "moved")

@@ -12,7 +12,6 @@ import geopandas as gpd
 import numpy as np
 import pandas as pd
 import shapely
-from scipy.optimize import linear_sum_assignment
 from shapely.geometry import Point, Polygon
 from shapely.ops import substring
 
@@ -83,6 +82,8 @@ def match_rows(
     ndarray of int, shape (n_pairs, 2)
         Positions in ``result`` and in ``reference``, ascending in the latter.
     """
+    from scipy.optimize import linear_sum_assignment  # much to load for runs that hold rows against none
+
     found, truth = shapely.force_2d(result), shapely.force_2d(reference)
     share = np.zeros((len(truth), len(found)))
     near_found, near_truth = shapely.buffer(found, width), shapely.buffer(truth, width)
