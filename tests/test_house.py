@@ -267,6 +267,12 @@ def test_the_library_is_light_until_it_is_used():
     assert {"prefect", "open3d"} & after == set()
 
 
+def test_a_cloud_is_read_before_what_works_on_it_is_loaded():
+    code = "import json, sys, vinemap.parcel; print(json.dumps(sorted(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {"geopandas", "pandas", "rasterio", "scipy.ndimage", "vinemap.chain"} & set(json.loads(run.stdout)) == set()
+
+
 def test_what_the_library_does_not_offer_is_told():
     import vinemap
 

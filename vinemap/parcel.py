@@ -21,7 +21,7 @@ from vinemap.geo.main import check_near
 from vinemap.product import store
 from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.stages import call
-from vinemap.surfaces.statistics import block_side
+from vinemap.surfaces.blocks import block_side
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -26,9 +26,9 @@ from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb
 from vinemap.simulate.survey import write_survey
 from vinemap.stages import call
+from vinemap.surfaces.blocks import block_side
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
-from vinemap.surfaces.statistics import block_side
 
 UTM = CRS.from_epsg(32632)
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from vinemap.geo.raster import Raster, grid_over
-from vinemap.surfaces.statistics import cells_a_block, order_statistics
+from vinemap.surfaces.blocks import cells_a_block
+from vinemap.surfaces.statistics import order_statistics
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud

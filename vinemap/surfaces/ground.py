@@ -16,8 +16,9 @@ from scipy.special import ndtr, ndtri
 
 from vinemap.errors import InputError
 from vinemap.geo.raster import Grid, Raster, cell_of, coarser, grid_over, sample
+from vinemap.surfaces.blocks import cells_a_block
 from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
-from vinemap.surfaces.statistics import cells_a_block, order_statistics
+from vinemap.surfaces.statistics import order_statistics
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud

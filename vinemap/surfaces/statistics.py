@@ -9,29 +9,18 @@ from scipy.ndimage import maximum_filter
 
 from vinemap.cloud.bins import quantiles_in
 from vinemap.geo.raster import Grid, Raster, above, coarser, spread, window
+from vinemap.surfaces.blocks import cells_a_block
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Floats, Values
 
-COARSE = 1.0
-"""Cell size in metres of the first, coarse surface."""
 LOWEST = 0.45
 """Metres of height below which there is grass and no canopy."""
 AROUND = 4.0
 """Metres, about: side of the squares in which the canopies' height is told, from theirs and from those beside them."""
 TOP = 0.97
 """Order of a square's heights that is its canopies'."""
-
-
-def cells_a_block(resolution: float) -> int:
-    """Cells a side of the blocks of the coarse surface."""
-    return max(1, round(COARSE / resolution))
-
-
-def block_side(resolution: float) -> float:
-    """Side in metres of the terrain model's blocks of cells, which a cloud in tiles must not divide."""
-    return cells_a_block(resolution) * resolution
 
 
 def order_statistics(
