@@ -43,6 +43,16 @@ def test_how_sure_a_fit_is_follows_from_how_far_patches_disagree():
     assert errors.std(axis=0) == pytest.approx(told, rel=0.1)
 
 
+def test_a_place_that_patches_put_elsewhere_is_as_unsure_as_that():
+    fit = fit_of(patches((0.4, -0.2), 0.002, noise=0.01), PLACE, CENTRE, FOCAL)
+    place, unsure = fit.turned(PLACE)
+    assert (place.row, place.column) == (PLACE.row, PLACE.column)
+    assert place.angle == fit.corrected(PLACE).angle
+    assert np.sqrt(np.diag(unsure.covariance)[:2]) == pytest.approx([0.4, 0.2], abs=0.02)
+    assert unsure.covariance[2, 2] == fit.covariance[2, 2]
+    assert np.linalg.eigvalsh(unsure.covariance)[0] > 0
+
+
 def test_a_patch_that_goes_its_own_way_does_not_agree():
     some = patches((0.5, 0.5), 0)
     some.shifts[3] = (5.0, -4.0)

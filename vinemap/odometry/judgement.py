@@ -115,6 +115,12 @@ class Fit(NamedTuple):
         column, row = self.shift
         return Place(place.angle + float(np.degrees(self.turn)), place.row + float(row), place.column + float(column))
 
+    def turned(self, place: Place) -> tuple[Place, Fit]:
+        """The place turned as the patches tell, and as unsure as they are and as far as they put it elsewhere."""
+        covariance = self.covariance.copy()
+        covariance[:2, :2] += np.outer(self.shift, self.shift)
+        return place._replace(angle=self.corrected(place).angle), self._replace(covariance=covariance)
+
 
 def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float) -> Fit | None:
     """Fit a movement to patches that agree, and a plane of any tilt at another height; none if they are too few.

@@ -187,8 +187,8 @@ def motion_between(
     patches = patches_at(view, next_view, centre, place)
     fit = fit_of(patches, place, centre, camera.fx)
     if fit and method == "aligned":
-        told = fit.corrected(place)
-        place = told if patches.unit == 1 or fit.spread > FINE_SPREAD else place._replace(angle=told.angle)
+        finer = patches.unit > 1 and fit.spread <= FINE_SPREAD
+        place, fit = fit.turned(place) if finer else (fit.corrected(place), fit)
     agreement, overlap = agree(place, most_change=CHANGED if method == "aligned" else CHANGED_ROUGHLY)
     score = dict(peaks)[top]
     at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]
