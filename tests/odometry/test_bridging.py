@@ -102,6 +102,17 @@ def test_wheels_without_yaw_rates_leave_the_turn_to_the_steps_beside():
     assert way.x_mm == pytest.approx(truth.x_mm, abs=5)
 
 
+def test_wheels_that_fall_silent_tell_nothing_of_a_gap():
+    """Their yaw rates go on."""
+    fixes, _ = track(bends())
+    wheels = wheels_of(bends(), speed=1.1).wheels
+    silent = wheels.speeds.copy()
+    silent[::2] = np.nan  # a file with speeds and yaw rates in turn
+    found, alone = bridged(fixes, Odometer(wheels._replace(speeds=silent))), bridged(fixes)
+    assert crossed(found).x_mm == pytest.approx(crossed(alone).x_mm, abs=5)
+    assert [found[k].of_step[0, 0] for k in GAP] == [alone[k].of_step[0, 0] for k in GAP]
+
+
 def test_a_gap_of_the_robots_own_making_is_no_surer_than_a_guess():
     fixes, _ = track(bends(), flag="score")
     found = bridged(fixes)

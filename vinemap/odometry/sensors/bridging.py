@@ -32,6 +32,8 @@ DEGREES = (1, 3)
 """Of splines through them."""
 WINDOWS = 1000
 """Stretches as long as a gap that it is held against, at most: the nearest."""
+UNTOLD = Pose(np.nan, np.nan, np.nan)
+"""What wheels are to tell themselves."""
 UNSEEN = frozenset({"unreadable", "size", "repeated", "blank"})
 """Flags of frames that were lost whatever the robot did meanwhile."""
 
@@ -100,9 +102,10 @@ def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
             seen[k] = step
         if fix.time is not None and before.time is not None:
             seconds[k] = fix.time - before.time
-        found = odometer.between(before.time, fix.time, step) if odometer else None
-        if odometer and found:
-            driven[k] = np.where(odometer.told, found[0], np.nan)
+        way = odometer.between(before.time, fix.time, UNTOLD._replace(heading_deg=step.heading_deg)) if odometer else None
+        turn = odometer.between(before.time, fix.time, UNTOLD) if odometer else None
+        if way and turn:
+            driven[k] = *way[0][:2], turn[0].heading_deg
     timed = (seconds[1:] > 0).all()
     return _Known(seen, driven, seconds if timed else np.ones(len(fixes)))
 

@@ -13,7 +13,7 @@ from vinemap.odometry.sensors.files import column, go_on, read_table
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.arrays import Values
 
 SPEEDS = {"speed_m_s": 1000.0, "speed_mm_s": 1.0, "speed_km_h": 1000 / 3.6}
 """Columns of speeds, and what makes mm/s of them."""
@@ -68,12 +68,6 @@ class Odometer:
         self.wheels = wheels
         self._seen = self._driven = FIRST_MM
         self._off, self._seconds = 0.0, FIRST_SECONDS
-
-    @property
-    def told(self) -> Flags:
-        """Whether wheels tell the way ahead, to the left, and the turn (3,)."""
-        speeds, rates = np.isfinite(self.wheels.speeds).any(), np.isfinite(self.wheels.rates).any()
-        return np.array([speeds, speeds, rates])
 
     def between(self, start: float | None, end: float | None, usual: Pose) -> tuple[Pose, Values] | None:
         """As :meth:`Wheels.between`, put right by what was seen so far."""
