@@ -144,6 +144,28 @@ def test_frames_that_a_recorder_dropped_count_by_their_time():
     assert crossed(bridged(fixes)).x_mm == pytest.approx(moved(true[59], true[70]).x_mm, abs=3)
 
 
+def test_a_pause_longer_than_any_stretch_that_frames_tell_is_no_way():
+    fixes, _ = track(bends())
+    on_hold = [fix._replace(time=fix.time + 3600.0 * (k > 65)) for k, fix in enumerate(fixes)]
+    assert [fix.pose for fix in bridged(on_hold)] == [fix.pose for fix in fixes]
+
+
+def test_a_pause_is_as_sure_as_stretches_that_last_as_long():
+    fixes, _ = track(bends())
+    late = [fix._replace(time=fix.time + 3.0 * (k > 65)) for k, fix in enumerate(fixes)]
+    longer, usual = (bridged(some)[GAP[-1] + 1].covariance[2, 2] for some in (late, fixes))
+    assert longer > 4 * usual
+
+
+def test_wheels_that_compare_with_few_stretches_are_trusted_less():
+    fixes, _ = track(bends())
+    wheels = wheels_of(bends(), speed=1.005).wheels
+    there = slice(2 * 43, 2 * 72)  # the gap, and hardly more than one stretch as long before it
+    parts = Odometer(wheels), Odometer(Wheels(*(values[there] for values in wheels))), None
+    often, once, alone = (bridged(fixes, wheels)[GAP[-1]].of_step[0, 0] for wheels in parts)
+    assert often < once == pytest.approx(alone)
+
+
 def test_places_that_contradict_what_bridges_a_gap_have_it_their_way():
     steps = [Pose(0.0, 0.0, 0.0) if k in range(62, 69) else step for k, step in enumerate(bends())]
     fixes, true = track(steps)

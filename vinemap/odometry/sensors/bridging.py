@@ -2,7 +2,7 @@
 
 On its way a robot knows what came before a gap. Afterwards more is known: the steps behind it, and wheels that were
 held against all other frames. How far each is to be believed is measured by the recording itself, over stretches as
-long that frames do tell.
+long, in frames and in time, that frames do tell.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import make_interp_spline
 
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
@@ -32,6 +31,8 @@ DEGREES = (1, 3)
 """Of splines through them."""
 WINDOWS = 1000
 """Stretches as long as a gap that it is held against, at most: the nearest."""
+DIFFERENT = 20
+"""How many of them, at most, begin within the length of one: nearer ones tell the same."""
 UNTOLD = Pose(np.nan, np.nan, np.nan)
 """What wheels are to tell themselves."""
 UNSEEN = frozenset({"unreadable", "size", "repeated", "blank"})
@@ -47,6 +48,8 @@ class _Known(NamedTuple):
     """By wheels."""
     seconds: Values
     """That they took (n,); 1 where there are no times."""
+    period: float
+    """The same of most of them."""
 
 
 def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]:
@@ -102,23 +105,41 @@ def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
             seen[k] = step
         if fix.time is not None and before.time is not None:
             seconds[k] = fix.time - before.time
-        way = odometer.between(before.time, fix.time, UNTOLD._replace(heading_deg=step.heading_deg)) if odometer else None
-        turn = odometer.between(before.time, fix.time, UNTOLD) if odometer else None
+        turning = UNTOLD._replace(heading_deg=step.heading_deg)
+        way, turn = (odometer.between(before.time, fix.time, p) if odometer else None for p in (turning, UNTOLD))
         if way and turn:
             driven[k] = *way[0][:2], turn[0].heading_deg
-    timed = (seconds[1:] > 0).all()
-    return _Known(seen, driven, seconds if timed else np.ones(len(fixes)))
+    if len(fixes) < 2 or not (seconds[1:] > 0).all():
+        return _Known(seen, driven, np.ones(len(fixes)), 1.0)
+    return _Known(seen, driven, seconds, float(np.median(seconds[1:])))
 
 
 def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] | None:
     """The steps to the frames behind one and up to another (n, 3), and the variance (3,) of each."""
     inside = np.arange(1, after - before + 1)
+    lasting = max(len(inside), round(known.seconds[before + inside].sum() / known.period))
+    as_long = np.arange(1, lasting + 1)
+    apart = 1 + lasting // DIFFERENT
     for around in range(AROUND, 0, -1):
         beside = _beside(known.seen, before, after, around)
-        alike = _alike(known.seen, before, inside, beside)
+        beside_it = beside + (lasting - len(inside)) * (beside > 0)
+        alike = _alike(known.seen, before, np.concatenate([as_long, beside_it]), apart)
         if len(alike):
             break
-    at = np.append(alike, before)[:, None]
+    off = np.sum(_ways(known, alike, as_long, beside_it) - known.seen[alike[:, None] + as_long], axis=2)
+    n = np.sum(~np.isnan(off), axis=1)
+    few = 1 + 2 / np.maximum(n * apart / lasting, 1)  # as Student's distribution is wider
+    told = _ways(known, np.array([before]), inside, beside)[:, 0]
+    usable = (n > 0) & ~np.isnan(told).any(axis=1)
+    spread = np.where(usable, few * np.nansum(off**2, axis=1) / np.maximum(n, 1), np.inf)
+    best = np.argmin(spread, axis=0)
+    variance = spread[best, range(3)]
+    return (told[best, :, range(3)].T, variance / len(inside)) if np.isfinite(variance).all() else None
+
+
+def _ways(known: _Known, at: Ints, inside: Ints, beside: Ints) -> Values:
+    """Steps (w, n, m, 3) by wheels and by splines inside stretches behind frames (n,), told by those beside them."""
+    at = at[:, None]
     ways = [known.driven[at + inside]]
     if beside.min(initial=1) < inside[0] and beside.max(initial=0) > inside[-1]:
         speeds = known.seen[at + beside] / known.seconds[at + beside, None]
@@ -128,19 +149,7 @@ def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] |
             for degree in DEGREES
             if degree < len(beside)
         ]
-    told = np.array(ways)
-    off = np.sum(told[:, :-1] - known.seen[at[:-1] + inside], axis=2)
-    spread = np.full((len(ways), 3), np.inf)
-    for k, errors in enumerate(off):
-        compared = ~np.isnan(errors)
-        np.divide(np.nansum(errors**2, axis=0), compared.sum(axis=0), out=spread[k], where=compared.any(axis=0))
-    spread[np.isnan(told[:, -1]).any(axis=1)] = np.inf
-    best = np.argmin(spread, axis=0)
-    variance = spread[best, range(3)]
-    if not np.isfinite(variance).all():
-        return None
-    few = 1 + 2 / max(len(alike) / len(inside), 1)  # as Student's distribution is wider
-    return told[best, -1, :, range(3)].T, variance * few / len(inside)
+    return np.array(ways)
 
 
 def _beside(seen: Values, before: int, after: int, around: int) -> Ints:
@@ -152,14 +161,11 @@ def _beside(seen: Values, before: int, after: int, around: int) -> Ints:
     return np.sort(np.array(found, int)) - before
 
 
-def _alike(seen: Values, before: int, inside: Ints, beside: Ints) -> Ints:
-    """The frames (n,) nearest to the one before a gap from which all steps like those in and beside it are told."""
-    steps = np.concatenate([inside, beside])
-    first, last = 1 - steps.min(), len(seen) - steps.max()
-    if last <= first:
-        return np.empty(0, int)
-    told = sliding_window_view(~np.isnan(seen[1:, 0]), int(np.ptp(steps)) + 1)
-    found = first + np.flatnonzero(told.all(axis=1))
+def _alike(seen: Values, before: int, steps: Ints, apart: int) -> Ints:
+    """The frames (n,) nearest to the one before a gap, so far apart, from which all such steps on are told."""
+    untold = np.cumsum(np.isnan(seen[:, 0]))
+    length = int(np.ptp(steps)) + 1
+    found = (np.flatnonzero(untold[length:] == untold[:-length]) + 1 - steps.min())[::apart]
     return np.sort(found[np.argsort(np.abs(found - before), kind="stable")][:WINDOWS])
 
 
