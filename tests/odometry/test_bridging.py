@@ -157,6 +157,14 @@ def test_a_pause_is_as_sure_as_stretches_that_last_as_long():
     assert longer > 4 * usual
 
 
+def test_a_pause_of_the_recorder_is_as_unsure_as_it_is_long():
+    fixes, _ = track(bends(), lost=range(60, 61), flag="score")
+    late = [fix._replace(time=fix.time + 0.8 * (k > 60)) for k, fix in enumerate(fixes)]  # five steps
+    assert np.diag(bridged(late)[61].of_step) == pytest.approx(25 * np.diag(GUESSED))
+    driven = bridged(late, wheels_of([*bends(), *bends()]))
+    assert np.diag(driven[61].of_step) == pytest.approx(np.diag(GUESSED))
+
+
 def test_wheels_that_compare_with_few_stretches_are_trusted_less():
     fixes, _ = track(bends())
     wheels = wheels_of(bends(), speed=1.005).wheels

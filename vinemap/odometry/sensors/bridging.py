@@ -57,8 +57,8 @@ def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]
 
     Each part of a step, ahead, to the left and its turn, is that of wheels, or of a spline through the steps beside the
     gap: of what comes closest to frames over stretches as long that they do tell, and as sure as that. A gap that may
-    come of the robot's own movement is no surer than a guess, as nothing like that was seen. What compares with no
-    other stretch is left as it was. Flags stay.
+    come of the robot's own movement is no surer than a guess over its time, as nothing like that was seen. What
+    compares with no other stretch is left as it was. Flags stay.
 
     Parameters
     ----------
@@ -68,18 +68,19 @@ def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]
         The sensor of that, which has learned of all frames.
     """
     known = _known(fixes, odometer)
-    joined = [(k, number) for k, number in enumerate(stretches(fixes)) if number]
+    in_stretches = [(k, number) for k, number in enumerate(stretches(fixes)) if number]
     measured = [np.diag(fix.of_step) for fix in fixes if fix.motion] or [np.zeros(3)]
     surest = np.median(measured, axis=0)
     steps: dict[int, tuple[Pose, Values]] = {}
-    for (before, stretch), (after, next_stretch) in pairwise(joined):
+    for (before, stretch), (after, next_stretch) in pairwise(in_stretches):
         found = _crossing(known, before, after) if stretch != next_stretch else None
         if found is None:
             continue
         lost = after - before > 1 and all(fix.flag in UNSEEN for fix in fixes[before + 1 : after])
         told, variance = found
         for k, step in enumerate(told, start=before + 1):
-            least = surest if lost else np.diag(fixes[k].of_step)
+            late = np.where(np.isnan(known.driven[k]), max(known.seconds[k] / known.period, 1), 1)
+            least = surest if lost else np.diag(fixes[k].of_step) * late**2
             steps[k] = Pose(*map(float, step)), np.diag(np.maximum(variance, least))
     return _carried(fixes, steps)
 
