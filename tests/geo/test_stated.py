@@ -206,10 +206,11 @@ def single(xyz):
         (1.0, 32610, lambda xyz: xyz, r"x is stored in steps of 1 \(scale 1\), 1 m"),
         (0.001, 32610, np.rint, r"x is stored in steps of 1 \(scale 0.001\)"),
         (0.001, 32610, single, r"y is stored in steps of 0.5 \(scale 0.001\)"),
+        (0.001 / FOOT, 32610, single, r"y is stored in steps of 0.498687 \(scale 0.00328083\)"),
         ((0.01, 0.01, 0.001), 4326, lambda xyz: xyz, r"x is stored in steps of 0.01 \(scale 0.01\), 870 m"),
         ((0.001, 0.001, 1.0), 32610, lambda xyz: xyz, r"z is stored in steps of 1 \(scale 1\)"),
     ],
-    ids=["metres", "rounded before", "single precision", "degrees", "heights"],
+    ids=["metres", "rounded before", "single precision", "in other steps since", "degrees", "heights"],
 )
 def test_coordinates_stored_too_coarsely_are_refused(tmp_path, points, scales, crs, stored, told):
     xyz = points + NAPA if crs == 32610 else points * [1.1e-5, 9e-6, 1] + [-122.304, 38.404, 0]

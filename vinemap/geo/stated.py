@@ -288,7 +288,8 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> No
     areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
     apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
     sizes = [*metres, vertical_unit(crs)]
-    for axis, shown, scale, size in zip("xyz", _shown_steps(sample), header.scales, sizes, strict=True):
+    shown_steps = _shown_steps(sample, header.scales)
+    for axis, shown, scale, size in zip("xyz", shown_steps, header.scales, sizes, strict=True):
         step = max(float(scale), shown)
         if step * size > max(FINE, apart):
             lie = f"lie {apart:.2f} m apart" if apart else "all lie in one place"
@@ -299,14 +300,18 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> No
             )
 
 
-def _shown_steps(sample: Floats) -> list[float]:
+def _shown_steps(sample: Floats, scales: Floats) -> list[float]:
     """Steps (3,) in which coordinates (n, 3) were rounded before, or kept in single precision; 0 where they weren't.
 
-    A scanner that drives along an axis leaves profiles at even steps of it alone, which is no rounding.
+    A scanner that drives along an axis leaves profiles at even steps of it alone, which is no rounding. Steps of single
+    precision are powers of two, to the scales (3,) in which they were stored since.
     """
     x, y, z = (_step(column) for column in sample.T)
     if not np.isclose(x, y, rtol=ALIKE):
-        x, y = (step if step > 0 and np.frexp(step)[0] == 0.5 else 0.0 for step in (x, y))
+        x, y = (
+            step if step > 0 and abs(step - 2.0 ** np.rint(np.log2(step))) < scale else 0.0
+            for step, scale in zip((x, y), scales[:2], strict=True)
+        )
     return [x, y, z]
 
 
