@@ -36,6 +36,16 @@ def test_patches_tell_movement_scale_and_slope():
     assert fit_of(patches((0, 0), 0), Place(0.0, 120.0, 160.0), CENTRE, FOCAL).slope is None
 
 
+def test_patches_in_a_line_tell_no_more_than_they_can():
+    along = np.linspace(0, 400, 13).round()
+    for seed in range(20):
+        shifts = np.random.default_rng(seed).normal(0, 0.1, (13, 2))
+        fit = fit_of(Patches(np.column_stack([along, np.full(13, 200.0)]), shifts, np.ones(13)), PLACE, CENTRE, FOCAL)
+        assert abs(fit.scale) < 0.01
+        assert fit.rest < 0.2
+        assert (np.linalg.eigvalsh(fit.covariance) > 0).all()
+
+
 def test_how_sure_a_fit_is_follows_from_how_far_patches_disagree():
     fits = [fit_of(patches((0, 0), 0, noise=0.3, seed=k), PLACE, CENTRE, FOCAL) for k in range(300)]
     errors = np.array([[*fit.shift, fit.turn] for fit in fits])

@@ -55,6 +55,8 @@ ROUNDS = 4
 ALIKE, MOST_LIKE = 1.6, 0.6
 """How much more patches vary together, at least, than each for itself, as neighbours err alike; the largest correlation
 of neighbours of which that is told."""
+SINGULAR = 1e10
+"""By how much variances are inflated, at least, by other unknowns that patches can't tell apart from theirs."""
 LEAST_SPREAD = 0.015
 """Pixels by which patches disagree at least."""
 
@@ -170,8 +172,11 @@ def _least_squares(slopes: Values, values: Values, sd: Values) -> tuple[Values, 
     normal = weighted.T @ weighted
     try:
         covariance: Values = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:  # patches in a line
-        covariance = np.linalg.pinv(normal, hermitian=True)
+        inflated = np.diag(covariance) * np.diag(normal)
+    except np.linalg.LinAlgError:
+        inflated = np.array(np.inf)
+    if not ((inflated > 0) & (inflated < SINGULAR)).all():  # patches in a line
+        covariance = np.linalg.pinv(normal, rcond=1 / SINGULAR, hermitian=True)
     return np.asarray(covariance @ (weighted.T @ (values / sd).ravel())), covariance
 
 
