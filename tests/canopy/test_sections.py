@@ -213,6 +213,20 @@ def test_a_side_that_hides_its_foot_is_like_the_other():
     assert feet[:, 1, 0].mean() == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.parametrize("across", [np.zeros(50), np.linspace(-0.6, 0.6, 50)], ids=["on a line", "above 3 m"])
+def test_a_foot_of_which_sides_tell_nothing_is_where_points_thin_out(across):
+    low = 0.5 if not across.any() else 3.2
+    points = [np.column_stack([across, np.random.default_rng(k).uniform(low, low + 1.5, 50)]) for k in range(60)]
+    _, feet = find_feet(many_sections(points))
+    assert feet[:, 0, 1] == pytest.approx(min(low, 3.0), abs=0.05)
+
+
+def test_no_foot_lies_in_the_ground():
+    heights = np.concatenate([np.linspace(0.2, 0.25, 5), np.linspace(1.5, 2, 95)])
+    _, feet = find_feet(many_sections([np.column_stack([np.linspace(-0.3, 0.3, 100), heights])] * 60))
+    assert feet[:, 0, 1].min() >= 0
+
+
 def test_indices_and_their_score():
     good, under, over = modelling_indices(np.array([0.9, 1.0]), np.array([1.1, 1.0]), np.array([1.0, 1.0]))
     assert good == pytest.approx([0.9, 1])

@@ -69,7 +69,7 @@ def _foot(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
     low, high, half, top = (_rank(levels, q) for q in (*FOOT_RANKS, 0.5, 1 - FOOT_RANKS[0]))
     thins_out = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
     reach = FOOT_DEPTH * (top - thins_out)
-    return np.minimum(thins_out, _rise(sides, reach, half)) * FOOT_BIN
+    return np.maximum(np.minimum(thins_out, _rise(sides, reach, half)), 0) * FOOT_BIN
 
 
 def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
@@ -138,7 +138,10 @@ def _rank(histograms: Values, q: float) -> Values:
 
 @compiled
 def _rise(histograms: Values, reach: Values, up_to: Values) -> Values:
-    """Bin (m,), up to one, from which on histograms (m, bins) of a canopy are most times what they are below it."""
+    """Bin (m,), up to one, from which on histograms (m, bins) of a canopy are most times what they are below it.
+
+    That one itself where they rise nowhere.
+    """
     m, bins = histograms.shape
     out = np.zeros(m)
     before = np.zeros(bins + 1)
@@ -146,8 +149,8 @@ def _rise(histograms: Values, reach: Values, up_to: Values) -> Values:
         for j in range(bins):
             before[j + 1] = before[j] + histograms[k, j]
         away = max(int(reach[k] + 0.5), 2)
-        most, at = 0.0, 0
-        for j in range(min(int(up_to[k]), bins) + 1):
+        most, at = 1.0, min(int(up_to[k]), bins - 1)
+        for j in range(at + 1):
             above, below = before[min(j + away, bins)] - before[j], before[j] - before[max(j - away, 0)]
             rise = (above + FOOT_STRAYS) / (below + FOOT_STRAYS)
             if rise > most:
