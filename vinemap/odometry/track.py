@@ -59,7 +59,7 @@ class Fix(NamedTuple):
     """Of the camera above the ground, by how large ground is from frame to frame, if it was the camera's at first."""
     flag: str = ""
     """Why it couldn't be measured; empty where it was. A flagged pose is carried on by the last movement, or is the
-    likeliest of several."""
+    likeliest of several; once a track is bridged, by what crosses its gap."""
     measured_from: int | None = None
     """Number of the frame, from 0 on, from which it was measured."""
     motion: Motion | None = None
