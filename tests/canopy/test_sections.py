@@ -221,6 +221,12 @@ def test_a_foot_of_which_sides_tell_nothing_is_where_points_thin_out(across):
     assert feet[:, 0, 1] == pytest.approx(min(low, 3.0), abs=0.05)
 
 
+def test_a_foot_at_which_nothing_was_seen_is_a_point():
+    heights = np.concatenate([np.full(3, 0.6), np.linspace(1.5, 2, 97)])  # it thins out at 0.4 m
+    _, feet = find_feet(many_sections([np.column_stack([np.linspace(-0.9, 0.9, 100), heights])] * 60))
+    assert np.abs(feet[:, :, 0]).max() == 0
+
+
 def test_no_foot_lies_in_the_ground():
     heights = np.concatenate([np.linspace(0.2, 0.25, 5), np.linspace(1.5, 2, 95)])
     _, feet = find_feet(many_sections([np.column_stack([np.linspace(-0.3, 0.3, 100), heights])] * 60))

@@ -75,7 +75,7 @@ def _foot(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
 def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
     """How far (2, m) to the right and left sections reach at their feet, told by those in each one's window.
 
-    A side of which next to nothing was seen there is as far as the other.
+    A side of which next to nothing was seen there is as far as the other; a foot of which nothing was is a point.
     """
     across = canopy.points[:, 0]
     bins = math.ceil(float(np.abs(across).max(initial=FOOT_BIN)) / FOOT_BIN) + 1
@@ -121,7 +121,7 @@ def _histograms(values: Values, start: Ints, low: float, width: float, bins: int
 
 @compiled
 def _rank(histograms: Values, q: float) -> Values:
-    """Quantile (m,) of histograms (m, bins), in bins."""
+    """Quantile (m,) of histograms (m, bins), in bins; 0 of empty ones."""
     out = np.zeros(len(histograms))
     m, bins = histograms.shape
     for k in range(m):
@@ -132,7 +132,7 @@ def _rank(histograms: Values, q: float) -> Values:
         while before + histograms[k, i] < wanted:
             before += histograms[k, i]
             i += 1
-        out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total else 0.5 * bins
+        out[k] = i + (wanted - before) / max(histograms[k, i], 1e-9) if total else 0.0
     return out
 
 
