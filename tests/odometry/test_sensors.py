@@ -14,7 +14,7 @@ from vinemap.odometry.sensors.places import Places, read_places
 from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, Wheels, read_wheels
 from vinemap.odometry.step import Motion
-from vinemap.odometry.track import Fix, follow
+from vinemap.odometry.track import UNSURE_MM, UNSURE_SHARE, Fix, follow
 from vinemap.simulate.camera import LOW
 
 START = Start(44.61167, 7.92442, 72.5)
@@ -66,8 +66,9 @@ def test_wheels_drive_an_arc():
 def test_what_wheels_dont_know_is_as_usual():
     straight = wheels(rate=np.nan).between(0.0, 1.0, Pose(30.0, 0.0, 4.0))[0]
     assert straight.heading_deg == pytest.approx(4.0)
-    slow = wheels(speed=np.nan).between(0.0, 1.0, Pose(30.0, 0.0, 4.0))[0]
+    slow, covariance = wheels(speed=np.nan).between(0.0, 1.0, Pose(30.0, 0.0, 4.0))
     assert slow.x_mm == pytest.approx(30.0, rel=0.01)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(UNSURE_MM + 30 * UNSURE_SHARE)  # a guess, and as sure as one
 
 
 def test_an_odometer_learns_its_scale_and_drift_of_frames():

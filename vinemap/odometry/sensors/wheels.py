@@ -9,6 +9,7 @@ import numpy as np
 from vinemap.errors import InputError
 from vinemap.odometry.poses import Pose
 from vinemap.odometry.sensors.files import column, go_on, read_table
+from vinemap.odometry.track import UNSURE_DEG, UNSURE_MM, UNSURE_SHARE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,8 +26,8 @@ LONGEST_GAP = 1.0
 """Seconds between two samples beyond which nothing is known."""
 SPEED_SHARE, SLIP_MM = 0.02, 1.0
 """Standard deviation of a way by wheels: a share of it, and millimetres."""
-RATE_SHARE, RATE_DEG, UNKNOWN_TURN_DEG = 0.02, 0.1, 3.0
-"""Standard deviation of a turn by yaw rates: a share of it, and degrees; and of a turn that nothing tells."""
+RATE_SHARE, RATE_DEG = 0.02, 0.1
+"""Standard deviation of a turn by yaw rates: a share of it, and degrees."""
 FIRST_MM, FIRST_SECONDS = 300.0, 2.0
 """Way and time for which wheels are believed as they are."""
 
@@ -39,7 +40,7 @@ class Wheels(NamedTuple):
     rates: Values
 
     def between(self, start: float | None, end: float | None, usual: Pose) -> tuple[Pose, Values] | None:
-        """Movement and its covariance (3, 3) from a time to another, what isn't measured as usual; none of a gap."""
+        """Movement and covariance (3, 3) from a time to another, a guess as usual where untold; none of a gap."""
         if start is None or end is None or not self.times[0] <= start < end <= self.times[-1]:
             return None
         first, last = np.searchsorted(self.times, start, "right"), np.searchsorted(self.times, end, "left")
@@ -51,12 +52,13 @@ class Wheels(NamedTuple):
         turned = not np.isnan(rates).any()
         turns = steps * rates if turned else steps * usual.heading_deg / (end - start)
         ways = steps * np.interp(middles, self.times, self.speeds)
-        if np.isnan(ways).any():
+        driven = not np.isnan(ways).any()
+        if not driven:
             ways = steps * usual.x_mm / (end - start)
         headings = np.radians(np.cumsum(turns) - turns / 2)
         turn, way = float(turns.sum()), float(np.abs(ways).sum())
-        sd = np.hypot(SPEED_SHARE * way, SLIP_MM)
-        turn_sd = np.hypot(RATE_SHARE * turn, RATE_DEG) if turned else UNKNOWN_TURN_DEG
+        sd = np.hypot(SPEED_SHARE * way, SLIP_MM) if driven else UNSURE_MM + UNSURE_SHARE * way
+        turn_sd = np.hypot(RATE_SHARE * turn, RATE_DEG) if turned else UNSURE_DEG
         movement = Pose(float(ways @ np.cos(headings)), float(ways @ np.sin(headings)), turn)
         return movement, np.diag([sd**2, sd**2, turn_sd**2])
 
