@@ -46,6 +46,21 @@ def track(n=30, *, lost=(), seed=0, period=0.2):
     return fixes, true
 
 
+def slopes_of(start, end, by=1e-3):
+    """Slopes (3, 6) of the movement from a pose to another by both."""
+    ways = [
+        moved(
+            *(
+                pose._replace(**{name: getattr(pose, name) + by}) if turn == k else pose
+                for k, pose in enumerate((start, end))
+            )
+        )
+        for turn in range(2)
+        for name in Pose._fields
+    ]
+    return (np.array(ways) - moved(start, end)).T / by
+
+
 def off(fixes, true):
     return np.array([np.hypot(f.pose.x_mm - t.x_mm, f.pose.y_mm - t.y_mm) for f, t in zip(fixes, true, strict=True)])
 
@@ -115,6 +130,31 @@ def test_the_covariance_of_a_pulled_track_is_that_of_its_errors():
         e = np.array(found[9].pose[:2]) - true[9][:2]
         z.append(e @ np.linalg.solve(found[9].covariance[:2, :2], e))
     assert 1.4 < np.mean(z) < 2.7  # 2 expected, 95% of 80 degrees of freedom
+
+
+def test_covariances_of_a_pulled_track_are_those_of_its_whole_normal_matrix():
+    """Keyframes make a tree of it; places are at both ends and in its midst."""
+    fixes, true = track(40, lost={8, 9, 25})
+    for k, fix in enumerate(fixes):
+        if fix.motion:
+            key = (k - 1) // 4 * 4
+            motion = Motion(*moved(fixes[key].pose, fix.pose), fix.of_step)
+            fixes[k] = fix._replace(measured_from=key, motion=motion)
+    at = np.array([0, 22, 39])
+    found = pulled(fixes, Places(at * 0.2, np.array([true[k][:2] for k in at]), np.full(3, 20.0))).fixes
+    normal = np.zeros((40, 3, 40, 3))
+    normal[0, :, 0] = np.diag([1e-6, 1e-6, 1e-2])
+    normal[at, :2, at, :2] += np.eye(2) / 20**2
+    for k, fix in enumerate(found[1:], start=1):
+        parent = k - 1 if fix.measured_from is None else fix.measured_from
+        slopes = slopes_of(found[parent].pose, fix.pose)
+        known = (slopes.T @ np.linalg.inv(fix.of_step) @ slopes).reshape(2, 3, 2, 3)
+        for a, row in enumerate((parent, k)):
+            for b, column in enumerate((parent, k)):
+                normal[row, :, column] += known[a, :, b]
+    whole = np.linalg.inv(normal.reshape(120, 120)).reshape(40, 3, 40, 3)
+    for k, fix in enumerate(found):
+        assert fix.covariance == pytest.approx(whole[k, :, k], rel=1e-3, abs=1e-4)
 
 
 def test_a_track_that_begins_with_bad_frames_is_pulled_too():

@@ -18,20 +18,18 @@ from vinemap.odometry.poses import Pose, moved
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from scipy.sparse import csc_matrix
-
-    from vinemap.compute.arrays import Values
+    from vinemap.compute.arrays import Flags, Values
     from vinemap.odometry.sensors.places import Places
     from vinemap.odometry.track import Fix
 
 START_MM, START_DEG = 1000.0, 10.0
 """Standard deviations of a start where fixes know better."""
+PRIOR = np.array([1 / START_MM, 1 / START_MM, 1 / np.radians(START_DEG)])
+"""Square roots of the information (3,) that a start is."""
 FAR = 4.0
 """Standard deviations from the track from which on a fix is left out."""
 LIKELY = 0.999
 """Probability of an error that is no larger, from which on steps and places contradict each other."""
-BLOCK = 300
-"""Columns of the inverse that are solved for at once."""
 
 
 class Pulled(NamedTuple):
@@ -63,13 +61,13 @@ def pulled(fixes: Sequence[Fix], places: Places) -> Pulled:
     kept = used & (np.hypot(*places.xy.T) < 2 * way + FAR * (START_MM + places.sd))
     at_first = poses
     for _ in range(int(used.sum()) + 1):
-        poses, factors, misfit = _solved(at_first, graph, places, kept)
+        poses, misfit = _solved(at_first, graph, places, kept)
         off = np.hypot(*(_place_at(poses, at, weight) - places.xy).T) / places.sd
         worst = int(np.argmax(np.where(kept, off, 0)))
         if not kept[worst] or off[worst] <= FAR or kept.sum() <= 1:
             break
         kept[worst] = False
-    covariances = factors.blocks() / unit[:, None] / unit
+    covariances = _covariances(poses, graph, places, kept) / unit[:, None] / unit
     poses[:, 2] = np.degrees(poses[:, 2])
     out = [
         fix._replace(pose=Pose(*map(float, pose)), covariance=covariance)
@@ -104,30 +102,22 @@ def _place_at(poses: Values, at: Values, weight: Values) -> Values:
     return poses[at[:, 0], :2] * (1 - weight[:, None]) + poses[at[:, 1], :2] * weight[:, None]
 
 
-def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple[Values, _Factors, float]:
-    """Poses by Gauss–Newton, the factors there, and what is left of all squared errors over their variances."""
+def _solved(poses: Values, graph: _Graph, places: Places, kept: Flags) -> tuple[Values, float]:
+    """Poses by Gauss–Newton, and what is left of all squared errors over their variances."""
     poses = poses.copy()
     first = poses[0].copy()
-    prior = np.array([1 / START_MM, 1 / START_MM, 1 / np.radians(START_DEG)])
     i, j = graph.links.T
+    n = len(i)
+    rows = np.repeat(np.arange(3 * n).reshape(n, 3), 3, axis=1).reshape(-1)
+    at, weight = graph.frames[kept], graph.weight[kept]
+    under = 3 * n + 3 + np.arange(2 * len(at))
     for _ in range(10):
-        c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
-        d = poses[j] - poses[i]
-        ahead, left = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
-        off = np.column_stack([ahead, left, d[:, 2]]) - graph.steps
-        of_j, of_i = np.zeros((2, len(i), 3, 3))
-        of_j[:, 0, 0], of_j[:, 0, 1], of_j[:, 1, 0], of_j[:, 1, 1], of_j[:, 2, 2] = c, s, -s, c, 1
-        of_i[:] = -of_j
-        of_i[:, 0, 2], of_i[:, 1, 2] = left, -ahead
-        n = len(i)
-        rows = np.repeat(np.arange(3 * n).reshape(n, 3), 3, axis=1).reshape(-1)
+        off, of_i, of_j = _linear(poses, graph)
         entries = [
-            (rows, np.tile(3 * ends[:, None] + np.arange(3), 3).reshape(-1), (graph.sure @ part).reshape(-1))
+            (rows, np.tile(3 * ends[:, None] + np.arange(3), 3).reshape(-1), part.reshape(-1))
             for ends, part in ((i, of_i), (j, of_j))
         ]
-        entries.append((3 * n + np.arange(3), np.arange(3), prior))
-        at, weight = graph.frames[kept], graph.weight[kept]
-        under = 3 * n + 3 + np.arange(2 * len(at))
+        entries.append((3 * n + np.arange(3), np.arange(3), PRIOR))
         entries += [
             (under, (3 * at[:, [end]] + np.arange(2)).reshape(-1), np.repeat(part / places.sd[kept], 2))
             for end, part in ((0, 1 - weight), (1, weight))
@@ -135,35 +125,52 @@ def _solved(poses: Values, graph: _Graph, places: Places, kept: Values) -> tuple
         row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
         slopes = coo_matrix((value, (row, column)), shape=(3 * n + 3 + 2 * len(at), poses.size)).tocsc()
         misses = (_place_at(poses, at, weight) - places.xy[kept]) / places.sd[kept, None]
-        of_steps = np.einsum("nij,nj->ni", graph.sure, off).reshape(-1)
-        residuals = np.concatenate([of_steps, prior * (poses[0] - first), misses.reshape(-1)])
-        factors = _Factors((slopes.T @ slopes).tocsc())
-        step = factors.solve((slopes.T @ residuals)[:, None])
+        residuals = np.concatenate([off.reshape(-1), PRIOR * (poses[0] - first), misses.reshape(-1)])
+        normal = slopes.T @ slopes
+        scale = 1 / np.sqrt(normal.diagonal())  # unknowns alike
+        factors = splu((diags(scale) @ normal @ diags(scale)).tocsc())
+        step = scale * factors.solve(scale * (slopes.T @ residuals))
         poses -= step.reshape(-1, 3)
         if np.abs(step).max() < 1e-6:
             break
-    return poses, factors, float(residuals @ residuals)
+    return poses, float(residuals @ residuals)
 
 
-class _Factors:
-    """Factors of a normal matrix, its unknowns scaled alike."""
+def _linear(poses: Values, graph: _Graph) -> tuple[Values, Values, Values]:
+    """Errors (n, 3) of steps in standard deviations, and their slopes (n, 3, 3) by poses they lead from and to."""
+    i, j = graph.links.T
+    c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
+    d = poses[j] - poses[i]
+    ahead, left = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
+    off = np.column_stack([ahead, left, d[:, 2]]) - graph.steps
+    of_j, of_i = np.zeros((2, len(i), 3, 3))
+    of_j[:, 0, 0], of_j[:, 0, 1], of_j[:, 1, 0], of_j[:, 1, 1], of_j[:, 2, 2] = c, s, -s, c, 1
+    of_i[:] = -of_j
+    of_i[:, 0, 2], of_i[:, 1, 2] = left, -ahead
+    return np.einsum("nij,nj->ni", graph.sure, off), graph.sure @ of_i, graph.sure @ of_j
 
-    def __init__(self, normal: csc_matrix) -> None:
-        self.scale = 1 / np.sqrt(normal.diagonal())
-        self.factors = splu((diags(self.scale) @ normal @ diags(self.scale)).tocsc())
 
-    def solve(self, right: Values) -> Values:
-        """Unknowns (n, m) of right sides (n, m)."""
-        return np.asarray(self.scale[:, None] * self.factors.solve(self.scale[:, None] * right))
+def _covariances(poses: Values, graph: _Graph, places: Places, kept: Flags) -> Values:
+    """Covariances (n + 1, 3, 3) of poses in mm and radians.
 
-    def blocks(self) -> Values:
-        """The (3, 3) on the diagonal of the inverse, for each pose."""
-        size = len(self.scale)
-        out = []
-        for begin in range(0, size, BLOCK):
-            width = min(BLOCK, size - begin)
-            columns = np.zeros((size, width))
-            columns[begin + np.arange(width), np.arange(width)] = 1
-            part = self.solve(columns)[begin : begin + width].reshape(width // 3, 3, width // 3, 3)
-            out.append(np.einsum("kikj->kij", part))
-        return np.concatenate(out)
+    As each pose has one step to it, the graph is a tree but for places between two frames, which count for the nearer
+    one: what is known of a pose comes from the leaves up, and of the rest down from the root. D. Koller and
+    N. Friedman, Probabilistic Graphical Models, 2009, chapter 10.
+    """
+    known = np.zeros((len(poses), 3, 3))
+    known[0] = np.diag(PRIOR**2)
+    nearer = np.where(graph.weight[kept] < 0.5, *graph.frames[kept].T)
+    for axis in range(2):
+        np.add.at(known[:, axis, axis], nearer, places.sd[kept] ** -2.0)
+    _, above, below = _linear(poses, graph)
+    turned, parents = above.transpose(0, 2, 1), graph.links[:, 0]
+    own, cross, passed = below.transpose(0, 2, 1) @ below, turned @ below, turned @ above
+    out, gains = np.empty_like(known), np.empty_like(above)
+    for k in range(len(poses) - 1, 0, -1):
+        out[k] = np.linalg.inv(known[k] + own[k - 1])
+        gains[k - 1] = out[k] @ cross[k - 1].T
+        known[parents[k - 1]] += passed[k - 1] - cross[k - 1] @ gains[k - 1]
+    out[0] = np.linalg.inv(known[0])
+    for k in range(1, len(poses)):
+        out[k] += gains[k - 1] @ out[parents[k - 1]] @ gains[k - 1].T
+    return out
