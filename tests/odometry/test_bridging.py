@@ -174,6 +174,13 @@ def test_wheels_that_compare_with_few_stretches_are_trusted_less():
     assert often < once == pytest.approx(alone)
 
 
+def test_a_time_that_is_written_twice_costs_no_other_its_own():
+    fixes, _ = track([Pose(60.0, 0.0, 0.0)] * 140)
+    late = [fix._replace(time=fix.time + 1.0 * (k > 65)) for k, fix in enumerate(fixes)]
+    late[100] = late[100]._replace(time=late[99].time)
+    assert crossed(bridged(late)).x_mm == pytest.approx(16 * 60, abs=3)
+
+
 def test_places_that_contradict_what_bridges_a_gap_have_it_their_way():
     steps = [Pose(0.0, 0.0, 0.0) if k in range(62, 69) else step for k, step in enumerate(bends())]
     fixes, true = track(steps)

@@ -95,6 +95,17 @@ def test_an_odometer_learns_its_scale_and_drift_of_frames():
     assert movement.heading_deg == pytest.approx(5.0, abs=0.5)
 
 
+def test_an_odometer_learns_nothing_of_what_wheels_dont_tell():
+    half = wheels(speed=330.0, rate=12.0)
+    half.speeds[20:], half.rates[20:] = np.nan, np.nan
+    odometer, other = Odometer(half), Odometer(wheels(speed=330.0, rate=12.0))
+    for k in range(1, 20):
+        other.learn((k - 1) / 10, k / 10, Pose(30.0, 0.0, 1.0))
+    for k in range(1, 40):
+        odometer.learn((k - 1) / 10, k / 10, Pose(30.0, 0.0, 1.0))
+    assert odometer.between(0.5, 1.5, STILL)[0] == pytest.approx(other.between(0.5, 1.5, STILL)[0], abs=1e-9)
+
+
 def test_wheels_bridge_a_lost_stretch():
     robot = poses(14)
     shots = [None if 4 <= k < 11 else image for k, image in enumerate(images(robot))]

@@ -172,7 +172,7 @@ def map_drive(
         remarks += [f"{odd_places + far} of {odd_places + len(known.sd)} fixes left out"] * (odd_places + far > 0)
         remarks += ["fixes contradict the track by more than both err"] * (not fit)
     else:
-        fixes = bridged(fixes, odometer)
+        fixes = step(STAGES[1], bridged, fixes, odometer)
     layers = step(STAGES[1], placed, fixes)
     step(STAGES[2], _write, layers, out)
     flags = [fix.flag for fix in fixes if fix.flag]

@@ -15,6 +15,7 @@ from scipy.interpolate import make_interp_spline
 
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
 from vinemap.odometry.sensors.pulling import Pulled, pulled
+from vinemap.odometry.sensors.wheels import UNTOLD
 from vinemap.odometry.track import stretches
 
 if TYPE_CHECKING:
@@ -33,8 +34,6 @@ WINDOWS = 1000
 """Stretches as long as a gap that it is held against, at most: the nearest."""
 DIFFERENT = 20
 """How many of them, at most, begin within the length of one: nearer ones tell the same."""
-UNTOLD = Pose(np.nan, np.nan, np.nan)
-"""What wheels are to tell themselves."""
 UNSEEN = frozenset({"unreadable", "size", "repeated", "blank"})
 """Flags of frames that were lost whatever the robot did meanwhile."""
 
@@ -47,9 +46,9 @@ class _Known(NamedTuple):
     driven: Values
     """By wheels."""
     seconds: Values
-    """That they took (n,); 1 where there are no times."""
+    """That they took (n,): as most of them where nothing tells, and 1 of a recording without times."""
     period: float
-    """The same of most of them."""
+    """What most of them took."""
 
 
 def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]:
@@ -101,18 +100,15 @@ def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
     seen, driven = np.full((2, len(fixes), 3), np.nan)
     seconds = np.full(len(fixes), np.nan)
     for k, (before, fix) in enumerate(pairwise(fixes), start=1):
-        step = moved(before.pose, fix.pose)
         if number[k] and number[k] == number[k - 1]:
-            seen[k] = step
+            seen[k] = moved(before.pose, fix.pose)
         if fix.time is not None and before.time is not None:
             seconds[k] = fix.time - before.time
-        turning = UNTOLD._replace(heading_deg=step.heading_deg)
-        way, turn = (odometer.between(before.time, fix.time, p) if odometer else None for p in (turning, UNTOLD))
-        if way and turn:
-            driven[k] = *way[0][:2], turn[0].heading_deg
-    if len(fixes) < 2 or not (seconds[1:] > 0).all():
-        return _Known(seen, driven, np.ones(len(fixes)), 1.0)
-    return _Known(seen, driven, seconds, float(np.median(seconds[1:])))
+        if odometer and (told := odometer.between(before.time, fix.time, UNTOLD)):
+            driven[k] = told[0]
+    timed = seconds > 0
+    period = float(np.median(seconds[timed])) if timed.any() else 1.0
+    return _Known(seen, driven, np.where(timed, seconds, period), period)
 
 
 def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] | None:

@@ -28,6 +28,8 @@ SPEED_SHARE, SLIP_MM = 0.02, 1.0
 """Standard deviation of a way by wheels: a share of it, and millimetres."""
 RATE_SHARE, RATE_DEG = 0.02, 0.1
 """Standard deviation of a turn by yaw rates: a share of it, and degrees."""
+UNTOLD = Pose(np.nan, np.nan, np.nan)
+"""What wheels are to tell themselves."""
 FIRST_MM, FIRST_SECONDS = 300.0, 2.0
 """Way and time for which wheels are believed as they are."""
 
@@ -40,7 +42,10 @@ class Wheels(NamedTuple):
     rates: Values
 
     def between(self, start: float | None, end: float | None, usual: Pose) -> tuple[Pose, Values] | None:
-        """Movement and covariance (3, 3) from a time to another, a guess as usual where untold; none of a gap."""
+        """Movement and covariance (3, 3) from a time to another, a guess as usual where untold; none of a gap.
+
+        Of :data:`UNTOLD` as usual, NaN says what they don't tell.
+        """
         if start is None or end is None or not self.times[0] <= start < end <= self.times[-1]:
             return None
         first, last = np.searchsorted(self.times, start, "right"), np.searchsorted(self.times, end, "left")
@@ -55,7 +60,7 @@ class Wheels(NamedTuple):
         driven = not np.isnan(ways).any()
         if not driven:
             ways = steps * usual.x_mm / (end - start)
-        headings = np.radians(np.cumsum(turns) - turns / 2)
+        headings = np.radians(np.nan_to_num(np.cumsum(turns) - turns / 2))
         turn, way = float(turns.sum()), float(np.abs(ways).sum())
         sd = np.hypot(SPEED_SHARE * way, SLIP_MM) if driven else UNSURE_MM + UNSURE_SHARE * way
         turn_sd = np.hypot(RATE_SHARE * turn, RATE_DEG) if turned else UNSURE_DEG
@@ -83,13 +88,16 @@ class Odometer:
 
     def learn(self, start: float | None, end: float | None, seen: Pose) -> None:
         """Take a movement that frames tell into account."""
-        found = self.wheels.between(start, end, seen)
+        found = self.wheels.between(start, end, UNTOLD)
         if found is None or start is None or end is None:
             return
-        self._seen += abs(seen.x_mm)
-        self._driven += abs(found[0].x_mm)
-        self._off += seen.heading_deg - found[0].heading_deg
-        self._seconds += end - start
+        way, _, turn = found[0]
+        if not np.isnan(way):
+            self._seen += abs(seen.x_mm)
+            self._driven += abs(way)
+        if not np.isnan(turn):
+            self._off += seen.heading_deg - turn
+            self._seconds += end - start
 
 
 def read_wheels(path: Path) -> tuple[Wheels, int]:
