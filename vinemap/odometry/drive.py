@@ -71,7 +71,7 @@ class DriveSummary(NamedTuple):
             reasons = ", ".join(f"{count} {flag}" for flag, count in sorted(self.flags.items()))
             said.append(f"{sum(self.flags.values())} flagged ({reasons})")
         if self.n_stretches > 1:
-            said.append(f"in {self.n_stretches} stretches that nothing joins")
+            said.append(f"in {self.n_stretches} stretches that no frame joins")
         said += self.remarks
         if abs(self.sunk) > MOST_SUNK:
             said.append(f"ground came {100 * self.sunk:.0f}% closer than above_ground_mm: distances are as wrong there")
