@@ -92,3 +92,25 @@ def test_terrain_of_any_resolution_gives_the_same_level(vineyard, cloud, resolut
     assert levels.body.values.shape == levels.body.grid.shape
     at = np.concatenate([np.array(line.coords)[:, :2] for line in vineyard.rows.geometry])
     assert np.median(sample(levels.body, at)) == pytest.approx(0.4 * 2.0, rel=0.1)
+
+
+@pytest.mark.parametrize("vines", [{"height": 0.7, "half_width": 0.1, "bottom": 0.1, "leafiness": 20}, {}])
+def test_nothing_flat_is_left_nor_raises_the_level(cloud, vines):
+    """Neither cars nor pallets beside vines, young ones or old, that are narrower than canopies may be."""
+    rows = rows_of(6, length=20)
+    beside = rows[-1].mean(axis=0) + [0, 3.5]
+    sizes = [((0.85, 2.1), 1.5)] * 4 + [((0.6, 0.5), 1.0)] * 3
+    things = [Obstacle(*(beside + [2.6 * k - 8, 0]), *size, top, solid=True) for k, (size, top) in enumerate(sizes)]
+    survey = simulate(
+        [Vineyard("A", rows, dead=0, **vines)], hillside(0.05), obstacles=things, density=200, noise=0.02, seed=3
+    )
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    cover, levels = canopy_cover(points, canopy_height_model(points))
+    on_rows = np.concatenate([row[4:-4] for row in rows])
+    assert np.median(sample(cover, on_rows)) > 0.3
+    assert sample(levels.body, on_rows).max() < (0.45 if vines else 0.51)
+    x, y = np.meshgrid(*cover.grid.centres())
+    inside = shapely.contains_xy(shapely.box(*(beside - [10, 2]), *(beside + [10, 2.2])), x, y)
+    left = np.count_nonzero(cover.values[inside] > 0.12) * cover.grid.resolution**2
+    assert left < 0.1 * sum(4 * np.prod(size) for size, _ in sizes)

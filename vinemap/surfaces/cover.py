@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import distance_to
 from vinemap.compute.threads import in_threads, strips
 from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell, spread
+from vinemap.surfaces.flat import flat_things
 from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
@@ -101,7 +103,7 @@ def canopy_cover(
         Cell size in metres.
     low, high : float
         Heights in metres between which points count as canopy, the lower at the most where rows stand apart. What is
-        taller (trees, houses) or wider than a row of vines (huts, hedges, bushes) is left out.
+        taller (trees, houses) or wider than a row of vines (huts, hedges, bushes) is left out, or flat (cars, pallets).
     smoothing : float, optional
         Standard deviation in metres of the Gaussian that smooths both counts; by default the cloud's mean distance
         between points, and half a cell at the least.
@@ -114,7 +116,8 @@ def canopy_cover(
         Heights from which points count as canopy.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    top = height_about(chm, high)
+    flat = _grown(flat_things(chm, high), MARGIN, chm.grid.resolution)
+    top = height_about(replace(chm, values=np.where(flat, np.nan, chm.values)), high)
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
@@ -122,11 +125,12 @@ def canopy_cover(
     everything, body, crown, _ = counts
     k, side = _cells_a_block(resolution), _side(resolution)
     blocks = [block_sum(layer, k).astype(np.float32) for layer in counts]
-    touching = _closed(blocks[0], blocks[1] + blocks[3], side, TOUCHING)
-    if touching.any():
-        touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
     squares = Grid(grid.west, grid.north, side, *blocks[0].shape)
     about = _about(rows, squares)
+    things = spread(flat, chm.grid, squares) & ~about
+    touching = _closed(blocks[0], np.where(things, 0, blocks[1] + blocks[3]), side, TOUCHING)
+    if touching.any():
+        touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
     roofs = _roofs(chm, everything, body, grid, high)
     if about.any():
         roofs &= ~spread(about, squares, chm.grid)
@@ -140,8 +144,8 @@ def canopy_cover(
     density = cloud.size / max(1, int(np.count_nonzero(everything)))
     sigma = max(0.5, density**-0.5) if smoothing is None else smoothing / resolution
     cover = _share(canopy, everything, sigma, 0.1 * density)
-    no_vines = _no_vines(blocks[0], blocks[1], blocks[3], side, about).repeat(k, axis=0).repeat(k, axis=1)
-    cover[no_vines[: grid.ny, : grid.nx]] = 0.0
+    no_vines = things | _no_vines(blocks[0], blocks[1], blocks[3], side, about)
+    cover[no_vines.repeat(k, axis=0).repeat(k, axis=1)[: grid.ny, : grid.nx]] = 0.0
     if roofs.any():
         cover[spread(_grown(roofs, MARGIN, chm.grid.resolution), chm.grid, grid)] = 0.0
     return Raster(cover, grid, cloud.crs), levels
