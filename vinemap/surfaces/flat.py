@@ -1,4 +1,8 @@
-"""Things that are flat, as cars, pallets and roofs are and leaves never are: no vines, however narrow they may be."""
+"""Things that are flat and compact, as cars and pallets are: no vines, however narrow they may be.
+
+Leaves are rough, but the tops of trimmed vines may be flat, too: what is as long as a row is left, and everything where
+much is flat.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +16,23 @@ from vinemap.compute.threads import in_threads, strips
 from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
-    from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.compute.threads import Strip
     from vinemap.geo.raster import Raster
 
-EVEN = 0.1
-"""How far what is flat lies off a plane through 3 x 3 cells, in what is usual of all that stands there."""
-SMALL, LARGE = 0.25, 0.5
-"""Square metres that are flat of a thing, most of which is; and of one that may hang together with others."""
-MOST = 0.5
-"""Share of a thing that is flat."""
+EVEN, AS_GROUND, EACH = 0.1, 2.0, 4
+"""How far what is flat lies off a plane through 3 x 3 cells at the most, in what is usual of all that stands there, and
+of the ground, of which every so manyth row and column tells."""
+LEAST, MOST = 0.25, 0.5
+"""Square metres that are flat in one piece, and share of a thing that such pieces are."""
+LONG, FEW = 3.5, 0.5
+"""Length of a thing in its own widths from which on it may be vines, and share of what stands that is flat, at most."""
 AROUND = np.ones((3, 3))
 """A cell and those beside it."""
 
 
 def flat_things(chm: Raster, high: float) -> Flags:
-    """Cells (ny, nx) of things that are flat, or flat in part: far evener than the canopies thereabouts.
+    """Cells (ny, nx) of things that are flat, far evener than the canopies, and compact.
 
     Parameters
     ----------
@@ -43,17 +48,42 @@ def flat_things(chm: Raster, high: float) -> Flags:
     if not canopy.any():
         return out
     around = sliding_window_view(np.pad(heights, 1), (3, 3))
-    rough = _roughness(around, standing)
-    even = standing & (rough <= EVEN * np.median(rough[canopy]))
+    ground = np.zeros_like(standing)
+    known = np.isfinite(chm.values[::EACH, ::EACH])
+    ground[::EACH, ::EACH] = known & (around[::EACH, ::EACH].max(axis=(2, 3)) < LOWEST / 2)
+    rough = _roughness(around, standing | ground)
+    usual = AS_GROUND * np.median(rough[ground]) if ground.any() else np.inf
+    even = standing & (rough <= min(EVEN * np.median(rough[canopy]), usual))
     even[even] = around[even].min(axis=(1, 2)) >= LOWEST
-    if even.any():
-        places, things = label(even)[0], label(standing, AROUND)[0]
-        area = np.bincount(places.ravel()) * chm.grid.resolution**2
-        area[0] = 0.0
-        small, large = (binary_dilation((area >= least)[places], AROUND) for least in (SMALL, LARGE))
-        share = np.bincount(things.ravel(), small.ravel()) / np.maximum(np.bincount(things.ravel()), 1)
-        out |= large | (standing & (share >= MOST)[things])
+    places = label(even)[0]
+    area = np.bincount(places.ravel()) * chm.grid.resolution**2
+    area[0] = 0.0
+    if area.max() < LEAST:
+        return out
+    smooth = binary_dilation((area >= LEAST)[places], AROUND)[standing]
+    of = label(standing, AROUND)[0][standing] - 1
+    size = np.bincount(of)
+    flat = np.bincount(of, smooth) >= MOST * size
+    flat &= _length_in_widths(of, size, *np.nonzero(standing)) < LONG
+    if size[flat].sum() <= FEW * len(of):
+        out[standing] = flat[of]
     return out
+
+
+def _length_in_widths(of: Ints, size: Ints, y: Ints, x: Ints) -> Values:
+    """How many times as long as wide things are (m,), of which cells (n,) at rows and columns belong to each.
+
+    They are the sides of rectangles of the same second moments.
+    """
+
+    def mean(values: Values | Ints) -> Values:
+        return np.bincount(of, values) / size
+
+    columns, rows = mean(x), mean(y)
+    xx, yy, xy = mean(x * x) - columns**2, mean(y * y) - rows**2, mean(x * y) - columns * rows
+    half, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    cell = 1 / 12  # the second moment of one cell
+    return np.sqrt((half + apart + cell) / np.maximum(half - apart + cell, cell))
 
 
 def _roughness(around: Values, where: Flags) -> Values:
