@@ -10,6 +10,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vinemap import paths
+from vinemap.cloud.bins import block_side
 from vinemap.cloud.las import read_cloud
 from vinemap.cloud.pdal.engine import check_engines
 from vinemap.cloud.pdal.ground import classified
@@ -21,7 +22,6 @@ from vinemap.geo.main import check_near
 from vinemap.product import store
 from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.stages import call
-from vinemap.surfaces.blocks import block_side
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

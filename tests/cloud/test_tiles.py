@@ -15,6 +15,7 @@ from systems import POSIX
 
 from vinemap import paths
 from vinemap.chain import map_rows, model_canopies
+from vinemap.cloud.bins import block_side
 from vinemap.cloud.las import collected
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.tiles import Collector, TiledCloud
@@ -26,7 +27,6 @@ from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb
 from vinemap.simulate.survey import write_survey
 from vinemap.stages import call
-from vinemap.surfaces.blocks import block_side
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
 

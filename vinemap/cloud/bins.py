@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
     Indices = NDArray[np.int32]
 
+COARSE = 1.0
+"""Metres, about: side of the blocks of cells that are looked at first."""
+
 
 class Bins(NamedTuple):
     """Points of cell c, from the grid's north-western corner eastwards, are ``member[start[c]:start[c + 1]]``."""
@@ -31,6 +34,16 @@ class Bins(NamedTuple):
     """First entry (ny · nx + 1,) of each cell."""
     member: Indices
     """Points (n,) cell by cell, in their order within each."""
+
+
+def cells_a_block(resolution: float) -> int:
+    """Cells a side of a block."""
+    return max(1, round(COARSE / resolution))
+
+
+def block_side(resolution: float) -> float:
+    """Side in metres of a block of cells, which a cloud in tiles must not divide."""
+    return cells_a_block(resolution) * resolution
 
 
 def bin_points(xyz: Values, grid: Grid) -> Bins:

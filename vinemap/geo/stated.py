@@ -309,7 +309,7 @@ def _shown_steps(sample: Floats, scales: Floats) -> list[float]:
     x, y, z = (_step(column) for column in sample.T)
     if not np.isclose(x, y, rtol=ALIKE):
         x, y = (
-            step if step > 0 and abs(step - 2.0 ** np.rint(np.log2(step))) < scale else 0.0
+            step if step > 0 and abs(step - 2.0 ** np.rint(np.log2(step))) <= scale else 0.0
             for step, scale in zip((x, y), scales[:2], strict=True)
         )
     return [x, y, z]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from vinemap.cloud.bins import cells_a_block
 from vinemap.geo.raster import Raster, grid_over
-from vinemap.surfaces.blocks import cells_a_block
 from vinemap.surfaces.statistics import order_statistics
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.ndimage import binary_opening, gaussian_filter
 from scipy.special import ndtr, ndtri
 
+from vinemap.cloud.bins import cells_a_block
 from vinemap.errors import InputError
 from vinemap.geo.raster import Grid, Raster, cell_of, coarser, grid_over, sample
-from vinemap.surfaces.blocks import cells_a_block
 from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
 from vinemap.surfaces.statistics import order_statistics
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from vinemap.cloud.bins import quantiles_in
+from vinemap.cloud.bins import cells_a_block, quantiles_in
 from vinemap.geo.raster import Grid, Raster, above, coarser, spread, window
-from vinemap.surfaces.blocks import cells_a_block
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
