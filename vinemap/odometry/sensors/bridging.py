@@ -43,6 +43,8 @@ class _Known(NamedTuple):
 
     seen: Values
     """By frames."""
+    untold: Ints
+    """How many of them up to each frame (n,) frames don't tell."""
     driven: Values
     """By wheels."""
     seconds: Values
@@ -66,8 +68,9 @@ def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]
     odometer : Odometer, optional
         The sensor of that, which has learned of all frames.
     """
-    known = _known(fixes, odometer)
-    in_stretches = [(k, number) for k, number in enumerate(stretches(fixes)) if number]
+    numbers = stretches(fixes)
+    known = _known(fixes, numbers, odometer)
+    in_stretches = [(k, number) for k, number in enumerate(numbers) if number]
     measured = [np.diag(fix.of_step) for fix in fixes if fix.motion] or [np.zeros(3)]
     surest = np.median(measured, axis=0)
     steps: dict[int, tuple[Pose, Values]] = {}
@@ -95,12 +98,11 @@ def joined(fixes: Sequence[Fix], places: Places, odometer: Odometer | None = Non
     return min(found, pulled(fixes, places), key=lambda track: (track.left_out, not track.fits))
 
 
-def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
-    number = stretches(fixes)
+def _known(fixes: Sequence[Fix], numbers: Sequence[int], odometer: Odometer | None) -> _Known:
     seen, driven = np.full((2, len(fixes), 3), np.nan)
     seconds = np.full(len(fixes), np.nan)
     for k, (before, fix) in enumerate(pairwise(fixes), start=1):
-        if number[k] and number[k] == number[k - 1]:
+        if numbers[k] and numbers[k] == numbers[k - 1]:
             seen[k] = moved(before.pose, fix.pose)
         if fix.time is not None and before.time is not None:
             seconds[k] = fix.time - before.time
@@ -108,7 +110,8 @@ def _known(fixes: Sequence[Fix], odometer: Odometer | None) -> _Known:
             driven[k] = told[0]
     timed = seconds > 0
     period = float(np.median(seconds[timed])) if timed.any() else 1.0
-    return _Known(seen, driven, np.where(timed, seconds, period), period)
+    untold = np.cumsum(np.isnan(seen[:, 0]))
+    return _Known(seen, untold, driven, np.where(timed, seconds, period), period)
 
 
 def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] | None:
@@ -120,7 +123,7 @@ def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] |
     for around in range(AROUND, 0, -1):
         beside = _beside(known.seen, before, after, around)
         beside_it = beside + (lasting - len(inside)) * (beside > 0)
-        alike = _alike(known.seen, before, np.concatenate([as_long, beside_it]), apart)
+        alike = _alike(known.untold, before, np.concatenate([as_long, beside_it]), apart)
         if len(alike):
             break
     off = np.sum(_ways(known, alike, as_long, beside_it) - known.seen[alike[:, None] + as_long], axis=2)
@@ -158,9 +161,8 @@ def _beside(seen: Values, before: int, after: int, around: int) -> Ints:
     return np.sort(np.array(found, int)) - before
 
 
-def _alike(seen: Values, before: int, steps: Ints, apart: int) -> Ints:
+def _alike(untold: Ints, before: int, steps: Ints, apart: int) -> Ints:
     """The frames (n,) nearest to the one before a gap, so far apart, from which all such steps on are told."""
-    untold = np.cumsum(np.isnan(seen[:, 0]))
     length = int(np.ptp(steps)) + 1
     found = (np.flatnonzero(untold[length:] == untold[:-length]) + 1 - steps.min())[::apart]
     return np.sort(found[np.argsort(np.abs(found - before), kind="stable")][:WINDOWS])

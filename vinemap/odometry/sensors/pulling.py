@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2
+from scipy.special import chdtr
 
 from vinemap.odometry.poses import Pose, moved
 
@@ -73,8 +73,8 @@ def pulled(fixes: Sequence[Fix], places: Places) -> Pulled:
         fix._replace(pose=Pose(*map(float, pose)), covariance=covariance)
         for fix, pose, covariance in zip(fixes, poses, covariances, strict=True)
     ]
-    likely = 2 * kept.sum() == 0 or misfit <= chi2.ppf(LIKELY, 2 * kept.sum())
-    return Pulled(out, int(len(kept) - kept.sum()), bool(likely))
+    fits = not kept.any() or chdtr(2 * kept.sum(), misfit) <= LIKELY  # chi-squared
+    return Pulled(out, int(len(kept) - kept.sum()), bool(fits))
 
 
 class _Graph(NamedTuple):
