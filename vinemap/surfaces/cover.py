@@ -12,6 +12,7 @@ from scipy.ndimage import (
     binary_erosion,
     binary_opening,
     gaussian_filter,
+    label,
     uniform_filter,
 )
 
@@ -23,6 +24,8 @@ from vinemap.surfaces.flat import flat_things
 from vinemap.surfaces.statistics import LOWEST, height_about
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -48,10 +51,11 @@ TOUCHING = 1.4
 """Metres of closed canopy from which rows may touch."""
 ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
-BESIDE, ABOUT = 3.5, 6.0
-"""Metres about rows that touch in which they are told by where they stand apart, always and unless they are lower."""
-LOWER = 0.05
-"""Share of a row's points that reach above that level where it is no lower than those that touch."""
+ABOUT = 6.0
+"""Metres about rows that touch in which rows are told by where they stand apart, unless they are narrow."""
+PLANTS, BROAD, FEW = 0.25, 0.9, 0.2
+"""Share of a block's points that are canopy where something grows, metres across which a row isn't narrow, and share of
+it that may be as broad all the same."""
 FOOT, LEAST = 0.4, 0.2
 """Share of the canopies' height, and metres, from which low canopies are told from what grows beneath them."""
 RIDGE = 0.75
@@ -128,13 +132,13 @@ def canopy_cover(
     squares = Grid(grid.west, grid.north, side, *blocks[0].shape)
     about = _about(rows, squares)
     things = spread(flat, chm.grid, squares) & ~about
-    touching = _closed(blocks[0], np.where(things, 0, blocks[1] + blocks[3]), side, TOUCHING)
+    touching = closed = _closed(blocks[0], np.where(things, 0, blocks[1] + blocks[3]), side, TOUCHING)
     if touching.any():
-        touching &= ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
+        touching = closed & ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
     roofs = _roofs(chm, everything, body, grid, high)
     if about.any():
         roofs &= ~spread(about, squares, chm.grid)
-    apart = _apart(touching, body, crown, grid, metres, resolution)
+    apart = _apart(touching, closed, blocks[:2], squares, metres)
     apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = body
@@ -164,22 +168,30 @@ def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Val
     return cover
 
 
-def _apart(touching: Flags, body: Counts, crown: Counts, grid: Grid, metres: Grid, resolution: float) -> Flags:
+def _apart(touching: Flags, closed: Flags, counts: Sequence[Values], blocks: Grid, metres: Grid) -> Flags:
     """Cells of 1 m in which rows are told by where they stand apart: those where they touch, and those about them.
 
-    So a row is cut at one level all along. Rows that are lower than those that touch keep theirs.
+    So a row is cut at one level all along. What is lower than those that touch and touches none of them keeps its
+    own. Counts are of all points in blocks of cells, of canopy's, and of those above where rows stand apart.
     """
-    out = np.zeros(metres.ny * metres.nx, dtype=bool)
     if not touching.any():
-        return out.reshape(metres.shape)
-    blocks = Grid(grid.west, grid.north, _side(resolution), *touching.shape)
-    out[cells_in(metres, blocks)[touching]] = True
-    touch = out.reshape(metres.shape)
-    near, about = (_grown(touch, reach, metres.resolution) for reach in (BESIDE, ABOUT))
-    cells = cells_in(metres, grid).ravel()
-    plants, high = (np.bincount(cells, layer.ravel(), metres.ny * metres.nx) for layer in (body, crown))
-    lower = (high < LOWER * plants).reshape(metres.shape)
-    held: Flags = near | (about & ~lower)
+        return np.zeros(metres.shape, dtype=bool)
+    cells = cells_in(metres, blocks)
+
+    def any_of(where: Flags) -> Flags:
+        out: Flags = np.bincount(cells[where], minlength=metres.ny * metres.nx).reshape(metres.shape) > 0
+        return out
+
+    everything, plants = counts
+    held = _grown(any_of(touching), ABOUT, metres.resolution)
+    growing = (plants > PLANTS * everything) & held.ravel()[cells]
+    apart = growing & ~_grown(closed, MARGIN, blocks.resolution)
+    parts = label(apart, np.ones((3, 3)))[0]
+    broad = _closed(everything, plants, blocks.resolution, BROAD)[apart]
+    narrow = apart.copy()
+    narrow[apart] = (np.bincount(parts[apart], broad) <= FEW * np.bincount(parts[apart]))[parts[apart]]
+    if narrow.any():
+        held &= distance_to(any_of(growing & ~narrow)) <= distance_to(any_of(narrow))
     return held
 
 
