@@ -25,7 +25,7 @@ from vinemap.compute.beside import nearest_beside
 from vinemap.compute.links import parts_of
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
-from vinemap.surfaces.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, scan_cylinders, scan_spectrum
+from vinemap.surfaces.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, grain, scan_cylinders, scan_spectrum
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -42,6 +42,8 @@ NEAR_WAY, EQUAL = np.radians(12), 1.05
 """Radians from a block's direction within which a wave has it, and ratio of spacings up to which they are alike."""
 ALIKE, LIKE_SPACING = np.radians(10), 1.15
 """Radians of turn, and ratio of spacings, up to which windows beside each other have the same wave."""
+CLEAR, ASKEW = 0.3, np.radians(15)
+"""How clearly canopies are drawn out in a direction that tells a wave, and radians by which it must be nearer."""
 FAR_STRONGER = 4.0
 """Strength of a block over that of windows which it may decide."""
 
@@ -88,7 +90,9 @@ def estimate_row_field(
         peaks = _prescribed([peaks, *others], np.radians(row_direction))
     else:
         for second in others:
-            peaks, square = _one_way(peaks, second, least=least)
+            way, clear = grain(base.values, peaks.direction.shape, step)
+            peaks, second = _with_the_grain(peaks, second, way, clear)
+            peaks, square = _one_way(peaks, second, clear < CLEAR, least=least)
     peaks = _settled(_axial_median(peaks), least=least)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
@@ -129,12 +133,21 @@ def _axial_median(peaks: Peaks) -> Peaks:
     return Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
 
 
-def _one_way(peaks: Peaks, second: Peaks, *, least: float) -> tuple[Peaks, bool]:
+def _with_the_grain(peaks: Peaks, second: Peaks, way: Values, clear: Values) -> tuple[Peaks, Peaks]:
+    """Let windows have the wave first that runs as the canopies do in their middle: a wall's or a hedge's may be
+    stronger, and where blocks meet the other block's."""
+    off, other = (_axial(wave.direction, way) for wave in (peaks, second))
+    turned = (clear >= CLEAR) & (second.strength > 0) & (other < off - ASKEW)
+    pairs = list(zip(peaks, second, strict=True))
+    return tuple(Peaks(*(np.where(turned, *pair[::sense]) for pair in pairs)) for sense in (-1, 1))
+
+
+def _one_way(peaks: Peaks, second: Peaks, either: Flags, *, least: float) -> tuple[Peaks, bool]:
     """Give plantings in a square, where two directions are about as good, one a block; tell whether there are any.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
     """
-    both = (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
+    both = either & (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
     blocks, n = label(binary_closing(np.pad(both, 2), np.ones((3, 3)))[2:-2, 2:-2])
     out, square = [values.copy() for values in peaks], False
     for k in range(1, n + 1):

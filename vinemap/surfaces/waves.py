@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import sparse
 from scipy.fft import fft, irfft, rfft
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
@@ -33,6 +33,8 @@ PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
+EDGE, THERE = 0.35, 1.5
+"""Metres: standard deviations of the Gaussians by which edges of canopies are told, and of what tells their grain."""
 BATCH = 16
 
 
@@ -55,6 +57,22 @@ def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, 
     batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
     waves = in_threads(lambda batch: _strongest_wave(windows[*batch.T], taper, band), batches)
     return _peaks(waves, occupied, shape)
+
+
+def grain(cover: Values, shape: tuple[int, int], step: float) -> tuple[Values, Values]:
+    """Direction (my, mx) in radians along which canopy is drawn out about each node of a scan, and how clearly, 0–1.
+
+    It is that of the structure tensor (Bigün & Granlund 1987), which a lone line beyond a few metres doesn't turn.
+    """
+    stride = max(1, round(step / COVER_RESOLUTION))
+    padded = np.pad(cover, [(0, max(0, (m - 1) * stride + 1 - n)) for m, n in zip(shape, cover.shape, strict=True)])
+    south, east = (gaussian_filter(padded, EDGE / COVER_RESOLUTION, order=order) for order in ((1, 0), (0, 1)))
+    products = (east * east, south * south, east * south)
+    nodes = [gaussian_filter(p, THERE / COVER_RESOLUTION)[::stride, ::stride][: shape[0], : shape[1]] for p in products]
+    xx, yy, xy = nodes
+    # Rasters count rows southwards, and canopy lies across its gradient.
+    direction = np.mod(np.arctan2(-2 * xy, xx - yy) / 2 + np.pi / 2, np.pi)
+    return direction, np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12)
 
 
 def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> list[Peaks]:
