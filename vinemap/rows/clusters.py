@@ -7,6 +7,7 @@ ends are paired, the best fitting first, if each lies where the other's course l
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
 ALIGNED = 0.87
 """Cosine of the angle between two key points' rows up to which they may belong to one."""
-BESIDE, ASLANT, STRETCH = 4, 2.5, 6.0
-"""Rows on each side of a kink that are looked at, from so many metres before and after it up to so many."""
+BESIDE, ASLANT, STRETCH = 4, 2.5, 3.5
+"""Rows on each side of a kink that are looked at, from so many metres before and after it, and over so many."""
 
 
 def cluster_rows(
@@ -83,9 +84,11 @@ def cluster_rows(
     if thesis:
         return out.assign(cluster=pieces)
     position = _position_along(np.flatnonzero(kept), pieces, graph)
-    pieces, position = _torn(xy[kept], spacing[kept], pieces, position)
+    tree = cKDTree(xy[kept])
+    pieces, position = _torn(tree, spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
-    rows = join(ends, candidates(ends, max_gap), xy[kept], track_width=track_width, cover=cover)
+    beside = partial(_beside, tree, pieces=pieces, spacing=spacing[kept])
+    rows = join(ends, candidates(ends, max_gap, beside), tree, track_width=track_width, cover=cover)
     return out.assign(cluster=rows[pieces])
 
 
@@ -185,24 +188,24 @@ def _position_along(points: Ints, pieces: Ints, graph: csr_array) -> Values:
     return way_from(order[last])
 
 
-def _torn(xy: Values, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
-    """Pieces (n,) of key points (n, 2) and their places along them, torn at kinks where more rows end than go on.
+def _torn(tree: cKDTree, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
+    """Pieces (n,) of a tree of key points and their places along them, torn at kinks where more rows end than go on.
 
     There two blocks abut, at a track that narrows to nothing, and rows of both touch.
     """
-    pieces, position = pieces.copy(), position.copy()
+    xy, pieces, position = tree.data, pieces.copy(), position.copy()
     order = np.argsort(pieces, kind="stable")
     first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
-    tree = None
     for p in np.flatnonzero(np.diff(first)):
         members = order[first[p] : first[p + 1]]
         for s in reversed(_kinks(xy[members], position[members])):
-            tree = tree or cKDTree(xy)
             middle, before, after = (
                 xy[members[np.abs(position[members] - at).argmin()]]
                 for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
             )
-            if _end_beside(tree, pieces, middle, after - before, float(np.median(spacing[members]))):
+            own = pieces[members[:1]]
+            through, ended = _beside(tree, own, middle, after - before, pieces=pieces, spacing=spacing)
+            if ended > 2 * through:
                 beyond = members[position[members] > s]
                 pieces[beyond] = pieces.max() + 1
                 position[beyond] -= position[beyond].min()
@@ -234,10 +237,17 @@ def _kinks(xy: Values, position: Values) -> Values:
     return out
 
 
-def _end_beside(tree: cKDTree, pieces: Ints, middle: Values, along: Values, spacing: float) -> bool:
-    """Whether more of the rows beside a kink end there than go on through it."""
-    near = np.array(tree.query_ball_point(middle, np.hypot(STRETCH, BESIDE * spacing)))
-    x = (tree.data[near] - middle) @ along / np.hypot(*along)
-    before, after = (set(pieces[near[(way * x >= ASLANT) & (way * x <= STRETCH)]]) for way in (-1, 1))
-    # The row itself goes on; a row that ends here and another that begins count as one.
-    return len(before ^ after) > 2 * (len(before & after) - 1)
+def _beside(
+    tree: cKDTree, own: Ints, middle: Values, way: Values, length: float = 0.0, *, pieces: Ints, spacing: Values
+) -> tuple[int, int]:
+    """How many pieces beside a gap of a length, or a kink, go on through it, and how many don't, of a tree of points.
+
+    A row that ends there and another that begins are two that don't.
+    """
+    past = max(length / 2, ASLANT)
+    reach = np.hypot(past + STRETCH, BESIDE * float(spacing[tree.query(middle)[1]]))
+    near = np.array(tree.query_ball_point(middle, reach), dtype=np.intp)
+    x = (tree.data[near] - middle) @ way / np.hypot(*way)
+    sides = [pieces[near[(sign * x >= past) & (sign * x <= past + STRETCH)]] for sign in (-1, 1)]
+    before, after = (set(side) - set(own.tolist()) for side in sides)
+    return len(before & after), len(before ^ after)

@@ -19,7 +19,7 @@ from vinemap.rows.centre_line import CELL, smooth_course
 from vinemap.rows.tracks import gaps_between, on_tracks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
@@ -37,6 +37,8 @@ SHORT = 2.5
 """Metres below which a piece is too short to tell its own direction: the row field does."""
 STRIDE = 0.5
 """Metres between the places of a piece at which it is asked whether it turns."""
+STRAIGHT, BENT = 0.7, 0.4
+"""Cosines of the angles by which two ends may look past each other, and may where rows beside them bend alike."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 NEAR = 0.5
@@ -91,12 +93,14 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
     return out
 
 
-def candidates(ends: Ends, max_gap: float) -> Ints:
+def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]]) -> Ints:
     """Pairs of ends (k, 2) that may belong together, the best first.
 
     The lateral mismatch is that of the ends from the tangents of both (the mean of the two vanishes on an arc) or that
     of the middles of their last metres from the row field's direction; the smaller counts. It stays below 0.25 m + 5%
-    of the gap and 0.36 spacings.
+    of the gap and 0.36 spacings. Where rows beside it go on through the same bend, a gap may turn more than its row does
+    before and after: then its ends' tangents meet within it. ``beside(pieces, middle, way, length)`` tells how many go on, and
+    how many don't.
     """
     pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
@@ -111,16 +115,28 @@ def candidates(ends: Ends, max_gap: float) -> Ints:
 
     lateral = np.minimum(mismatch(ends.xy, ends.tangent), mismatch(ends.middle, ends.field))
     ahead = np.minimum((ends.field[a] * gap).sum(axis=1), -(ends.field[b] * gap).sum(axis=1))
-    facing = (ahead >= 0.7 * length - OVERLAP) & ((ends.field[a] * ends.field[b]).sum(axis=1) < -0.7)
+    against = -(ends.field[a] * ends.field[b]).sum(axis=1)
+    facing = (ahead >= STRAIGHT * length - OVERLAP) & (against > STRAIGHT)
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
     fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
+    aside = np.stack([_cross(ends.tangent[a], gap), _cross(gap, -ends.tangent[b])])
+    meet = (np.maximum(aside.min(axis=0), -aside.max(axis=0)) >= -gate) & (ahead >= BENT * length - OVERLAP) & (against > BENT)
+    for k in np.flatnonzero(meet & ~fits):
+        middle = (ends.xy[a[k]] + ends.xy[b[k]]) / 2
+        through, ended = beside(pairs[k] // 2, middle, ends.tangent[a[k]] - ends.tangent[b[k]], length[k])
+        fits[k] = through > 1 and ended <= 2 * through
     cost = length[fits] + 10 * lateral[fits]
     out: Ints = pairs[fits][np.argsort(cost, kind="stable")]
     return out
 
 
-def join(ends: Ends, pairs: Ints, xy: Values, *, track_width: float, cover: Raster | None = None) -> Ints:
-    """Row (m,) of each piece of key points (n, 2): ends are paired in the order of ``pairs`` (k, 2), but over no track.
+def _cross(one: Values, other: Values) -> Values:
+    out: Values = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+    return out
+
+
+def join(ends: Ends, pairs: Ints, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Ints:
+    """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2), but over no track.
 
     Each end is paired once.
     """
@@ -133,7 +149,7 @@ def join(ends: Ends, pairs: Ints, xy: Values, *, track_width: float, cover: Rast
             rows[rows == other] = one
     pairs = pairs[chosen]
     gaps = gaps_between(ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]], ends.spacing[pairs].mean(axis=1))
-    one, other = (pairs[~on_tracks(gaps, xy, track_width=track_width, cover=cover)] // 2).T
+    one, other = (pairs[~on_tracks(gaps, tree, track_width=track_width, cover=cover)] // 2).T
     return parts_of(len(rows), one, other)
 
 

@@ -67,7 +67,7 @@ def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:
     return Gaps((a + b) / 2, (b - a) / np.maximum(length, 1e-9)[:, None], length, spacing)
 
 
-def on_tracks(gaps: Gaps, xy: Values, *, track_width: float, cover: Raster | None = None) -> Flags:
+def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Flags:
     """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
     Gaps of neighbouring rows that lie side by side are judged as one. What lies farther than half a track from all key
@@ -80,7 +80,6 @@ def on_tracks(gaps: Gaps, xy: Values, *, track_width: float, cover: Raster | Non
     if len(wide) == 0:
         return out
     gaps = Gaps(*(values[wide] for values in gaps))
-    tree = cKDTree(xy)
     one, other, common = _side_by_side(gaps)
     covers = common >= COVERED * gaps.length[other]
     linked = covers & (gaps.length[one] <= LONGER * gaps.length[other])
