@@ -9,12 +9,13 @@ from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.surfaces.seen import Seen
+from vinemap.surfaces.waves import RowField
 
 SPACING = 2.5
 NO_GAPS = gpd.GeoDataFrame({"row": np.empty(0, dtype=int)}, geometry=[])
 
 
-def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=()):
+def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=(), likelihood=0.7):
     """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids."""
     table = {"spacing_m": np.full(len(lines), SPACING), "support": support, "contrast": contrast}
     rows = gpd.GeoDataFrame(table, geometry=[shapely.LineString(line) for line in lines], crs=32632)
@@ -35,7 +36,8 @@ def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0
         rasters.append(Raster(values, grid, rows.crs))
     grid = rasters[0].grid
     shown = ~shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(*grid.centres()))
-    rows = judge_rows(group_blocks(rows), *rasters, Seen(shown, grid, shown, grid))
+    field = RowField(*(Raster(np.full(grid.shape, value), grid, rows.crs) for value in (0.0, SPACING, likelihood)))
+    rows = judge_rows(group_blocks(rows), *rasters, field, Seen(shown, grid, shown, grid))
     return flag_rows(rows)
 
 
@@ -58,7 +60,7 @@ def test_flags():
 
 def test_rows_of_a_block_are_sure():
     assert judged(block(6))["confidence"].min() > 0.9
-    few = flag_rows(judge_rows(judged(block(6)).iloc[:0], None, None, None))
+    few = flag_rows(judge_rows(judged(block(6)).iloc[:0], None, None, None, None))
     assert few.empty
     assert {"confidence", "flags"} <= set(few)
 
@@ -73,6 +75,20 @@ def test_less_speaks_for_what_is_short_bare_or_stands_out_little():
     for worse in ({"contrast": 0.4}, {"support": 0.3}):
         assert judged(block(5), **worse)["confidence"].iloc[2] < whole
     assert judged(block(5, length=4.0))["confidence"].iloc[2] < whole - 0.1
+
+
+def test_what_wanders_where_there_is_no_wave_of_rows_is_none():
+    x = np.linspace(0, 60, 121)
+    line = np.column_stack([x, np.sin(x)])
+    assert judged([line])["confidence"].iloc[0] < 0.3
+    assert judged(block(1), likelihood=0.2)["confidence"].iloc[0] < 0.3
+    assert judged(block(5), likelihood=0.4)["confidence"].min() > 0.9
+
+
+def test_rows_that_bend_are_as_sure():
+    turn = np.linspace(-1, 1, 121)
+    bent = [np.column_stack([30 + r * np.sin(turn), 15 - r * np.cos(turn)]) for r in (8.0, 10.5, 13.0)]
+    assert judged(bent)["confidence"].min() > 0.9
 
 
 def test_a_row_that_stops_where_others_run_through_is_a_piece_of_one():

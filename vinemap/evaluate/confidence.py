@@ -2,50 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-import shapely
-from scipy.spatial import cKDTree
 
-from vinemap.compute.beside import nearest_beside
-from vinemap.geo.raster import Raster, sample_across
+from vinemap.evaluate.evidence import evidence
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
-    from vinemap.compute.arrays import Flags, Ints, Values
+    from vinemap.geo.raster import Raster
     from vinemap.surfaces.seen import Seen
+    from vinemap.surfaces.waves import RowField
 
-SLACK = 0.02
-"""Metres to which rows' courses are needed."""
-UNUSUAL = 1.5
-"""Ratio of a distance to the usual one, or its inverse, from which a row isn't beside another as it ought to be."""
-STEP = 0.5
-"""Metres between the stations at which rows are looked at."""
-REACH = 2.5
-"""Spacings within which a row has neighbours."""
-PARALLEL, STRAIGHT = np.cos(np.radians(10)), np.cos(np.radians(6))
-"""Cosine of the angle within which rows are parallel, and within which one goes on where another stopped."""
-SEAM = 4.0
-"""Metres before and after a place at which a neighbour ends and another begins: half a track and more."""
-TANGENT = 5.0
-"""Metres of a row that tell where it would go on."""
-LONGEST_GAP = 40.0
-"""Metres over which one row may go on in another."""
-AROUND = 3.5
-"""Spacings within which other rows tell whether there is a track."""
-LIKE = 4
-"""Nearest rows with the second narrowest of which, for its height, a canopy is compared."""
-ASIDE = 2 / 3
-"""Spacings aside of a row where the next one's canopy begins."""
-LONE = 1 / 3
-"""Company of a row that has none where the others have none, either."""
-RIDGE, FLANK = 0.35, 0.2
-"""Shares of a row's usual cover from which a station has canopy, and down to which that reaches across."""
-
-EVIDENCE = {"company": 3.0, "whole": 3.0, "alike": 3.0, "claimed": 2.0, "support": 2.0, "contrast": 4.0, "length": 4.0}
+EVIDENCE = {
+    "company": 3.0,
+    "whole": 3.0,
+    "alike": 3.0,
+    "claimed": 2.0,
+    "support": 2.0,
+    "contrast": 4.0,
+    "length": 4.0,
+    "wave": 4.0,
+    "smooth": 4.0,
+}
 """Logarithm of the odds by which each ingredient, from 0 to 1, makes a row more sure."""
 DOUBT = 3.3 - sum(EVIDENCE.values())
 """Logarithm of the odds of a row for which nothing speaks; 3.3, or 96%, is that of one for which everything does."""
@@ -53,44 +33,11 @@ CUT = 2.0
 """Logarithm of the odds by which a row is less sure all of whose canopy is cut."""
 
 
-class _Stations(NamedTuple):
-    """Points along all rows, one row after the other."""
-
-    row: Ints
-    xy: Values
-    tangent: Values
-    start: Ints
-    """First station (rows + 1,) of each row."""
-
-    def share(self, flags: Flags | Values) -> Values:
-        """Mean of what stations (n,) tell, row by row."""
-        out: Values = np.add.reduceat(flags.astype(float), self.start[:-1]) / np.diff(self.start)
-        return out
-
-    def median(self, values: Values) -> Values:
-        """Median of what stations (n,) tell where they tell something, row by row; NaN where none does."""
-        out: Values = pd.Series(values).groupby(self.row).median().to_numpy(dtype=float)
-        return out
-
-
-class _Beside(NamedTuple):
-    """The nearest parallel row to the left and to the right of stations (n, 2)."""
-
-    away: Values
-    """Metres; inf where there is none."""
-    row: Ints
-    """Which; −1 where there is none."""
-
-
-def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -> gpd.GeoDataFrame:
+def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField, seen: Seen) -> gpd.GeoDataFrame:
     """Give rows a ``confidence`` in 0–1, and the share of their canopy's length that is ``cut`` at a side.
 
-    Confidence is the share of rows like it that are right, as far as a logistic model of seven ingredients tells it,
-    each from 0 to 1 (``EVIDENCE`` has their weights): **company**, the share of the length along which another row runs
-    beside it at the distance that is usual for both, which tells less where most rows stand alone; **whole**, that it
-    doesn't go on beyond its end where others go on, nor crosses where those beside it end; **alike**, that its canopy
-    isn't far wider for its height than theirs; **claimed**, the share beside which no canopy stands where the next row
-    ought to be; its **support**; its **contrast**; and its **length** in spacings. Canopy is cut where what was seen
+    Confidence is the share of rows like it that are right, as far as a logistic model of what speaks for it tells it:
+    :func:`vinemap.evaluate.evidence.evidence` names that, ``EVIDENCE`` its weights. Canopy is cut where what was seen
     ends within it, at a boundary or at the cloud's own edge.
 
     Parameters
@@ -101,10 +48,14 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -
         Canopy cover 0–1.
     chm : Raster
         Canopy height in metres, NaN where there are no points.
+    field : RowField
+        As it was before rows were found.
     seen : Seen
         What the cloud shows.
     """
-    found = evidence(rows, cover, chm, seen)
+    if len(rows) == 0:
+        return rows.assign(confidence=np.empty(0), cut=np.empty(0))
+    found = evidence(rows, cover, chm, field, seen)
     odds = DOUBT + sum((weight * found[name].to_numpy() for name, weight in EVIDENCE.items()), np.zeros(len(rows)))
     return rows.assign(confidence=1 / (1 + np.exp(-odds)), cut=found["cut"].to_numpy())
 
@@ -133,192 +84,3 @@ def believed(
     sure, cut = (rows[name].to_numpy(dtype=float) for name in ("confidence", "cut"))
     less = np.maximum(sure / (sure + (1 - sure) * np.exp(CUT * cut)), min_confidence)
     return rows.assign(block=block, confidence=np.where(cut > 0, less, sure)), gaps.assign(row=position)
-
-
-def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, seen: Seen) -> pd.DataFrame:
-    """The ingredients of rows' confidence, each from 0 to 1: ``EVIDENCE`` names them; and how much of them is ``cut``.
-
-    Parameters are as of :func:`judge_rows`.
-    """
-    if len(rows) == 0:
-        return pd.DataFrame(columns=[*EVIDENCE, "cut"], dtype=float)
-    spacing = rows["spacing_m"].to_numpy(dtype=float)
-    lines = shapely.simplify(shapely.force_2d(rows.geometry.to_numpy()), SLACK)
-    at = _stations(lines)
-    beside = _beside(at, rows["block"].to_numpy(), REACH * spacing)
-    nearest = beside.away.min(axis=1)
-    usual = at.median(np.where(np.isfinite(nearest), nearest, np.nan))
-    usual = np.where(np.isfinite(usual), usual, spacing)
-    normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
-    ridge = sample_across(cover, at.xy, normal, np.arange(-2, 3) * cover.grid.resolution).max(axis=1)
-    level = at.median(np.where(ridge >= at.median(ridge)[at.row], ridge, np.nan))
-    standing = ridge > RIDGE * level[at.row]
-    shape = _aspect(at, chm, normal, np.where(standing, usual[at.row], np.nan))
-    company = at.share(_accompanied(at, beside, usual))
-    return pd.DataFrame(
-        {
-            "company": np.maximum(company, LONE * (1 - float(np.median(company)))),
-            "whole": 1 - np.maximum(_goes_on(at, usual, seen), _crosses(at, beside, usual)),
-            "alike": _alike(lines, shape),
-            "claimed": 1 - at.share(_unclaimed(at, beside, usual, cover, normal, level)),
-            "support": np.minimum(rows["support"].to_numpy(dtype=float) / 0.6, 1),
-            "contrast": np.clip((rows["contrast"].to_numpy(dtype=float) - 0.2) / 0.6, 0, 1),
-            "length": 1 - np.exp(-shapely.length(lines) / (2 * usual)),
-            "cut": _cut(at, usual, cover, seen, normal, np.where(standing, level[at.row], np.nan)),
-        }
-    )
-
-
-def _stations(lines: Values) -> _Stations:
-    n = np.maximum(2, np.rint(shapely.length(lines) / STEP).astype(int) + 1)
-    start = np.concatenate([[0], np.cumsum(n)])
-    row = np.repeat(np.arange(len(lines)), n)
-    share = (np.arange(start[-1]) - start[row]) / (n - 1)[row]
-    xy = shapely.get_coordinates(shapely.line_interpolate_point(lines[row], share, normalized=True))
-    each = np.arange(start[-1])
-    way = xy[np.minimum(each + 1, start[row + 1] - 1)] - xy[np.maximum(each - 1, start[row])]
-    return _Stations(row, xy, way / np.maximum(np.hypot(*way.T), 1e-9)[:, None], start)
-
-
-def _beside(at: _Stations, block: Ints, reach: Values) -> _Beside:
-    """The nearest row on both sides of every station, within the metres that rows (n,) of a block reach."""
-    wide = pd.Series(reach).groupby(block).transform("max").to_numpy()[at.row]
-    away, other = nearest_beside(at.xy, at.tangent, at.row, wide, along=0.75 * STEP, parallel=PARALLEL)
-    return _Beside(away, np.where(other >= 0, at.row[other], -1))
-
-
-def _seen_from(xy: Values, tangent: Values, other: Values) -> tuple[Values, Values]:
-    """Metres along a direction and to its left at which others lie."""
-    way = other - xy
-    return (way * tangent).sum(axis=-1), tangent[..., 0] * way[..., 1] - tangent[..., 1] * way[..., 0]
-
-
-def _accompanied(at: _Stations, beside: _Beside, usual: Values) -> Flags:
-    """Stations (n,) beside which a row runs at a distance that is usual for both."""
-    there = beside.row >= 0
-    expected = np.stack([np.repeat(usual[at.row][:, None], 2, axis=1), usual[beside.row]])
-    ratio = np.where(there, beside.away, np.nan) / expected
-    out: Flags = ((ratio > 1 / UNUSUAL) & (ratio < UNUSUAL)).all(axis=0).any(axis=1)
-    return out
-
-
-def _crosses(at: _Stations, beside: _Beside, usual: Values) -> Values:
-    """How far rows (n,) run on where those beside them end and others begin: 1 on both sides, 0.5 at an edge."""
-    k = round(SEAM / STEP)
-    next_ones = np.where(beside.away < UNUSUAL * usual[at.row][:, None], beside.row, -1)
-    before, after = next_ones[: -2 * k], next_ones[2 * k :]
-    one_row = (at.row[: -2 * k] == at.row[2 * k :])[:, None]
-    broken = one_row & (before != after) & (before >= 0) & (after >= 0)
-    none = one_row & (before < 0) & (after < 0)
-    seam = np.where(broken.all(axis=1), 1.0, np.where(broken.any(axis=1) & none.any(axis=1), 0.5, 0.0))
-    out = np.zeros(len(at.start) - 1)
-    np.maximum.at(out, at.row[k : k + len(seam)], seam)
-    return out
-
-
-def _goes_on(at: _Stations, usual: Values, seen: Seen) -> Values:
-    """How far rows (n,) end where another leads on and those around run through, from none of these to all.
-
-    What lies between must have been seen.
-    """
-    ends = np.column_stack([at.start[:-1], at.start[1:] - 1]).ravel()
-    row = at.row[ends]
-    back = round(TANGENT / STEP)
-    backwards, forwards = np.maximum(ends - back, at.start[row]), np.minimum(ends + back, at.start[row + 1] - 1)
-    inner = np.where(np.arange(len(ends)) % 2, backwards, forwards)
-    xy = at.xy[ends]
-    outward = xy - at.xy[inner]
-    outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
-    pairs = cKDTree(xy).query_pairs(LONGEST_GAP, output_type="ndarray")
-    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
-    gap, across = _seen_from(xy[i], outward[i], xy[j])
-    facing = (row[i] != row[j]) & (gap > 0) & ((outward[i] * outward[j]).sum(axis=1) < -STRAIGHT)
-    facing &= np.abs(across) < np.minimum(0.15 * usual[row[i]] + 0.03 * gap, 0.4 * usual[row[i]])
-    i, gap = i[facing], gap[facing]
-    middle = xy[i] + 0.5 * gap[:, None] * outward[i]
-    between = seen.at(middle)
-    i, gap, middle = i[between], gap[between], middle[between]
-    out = np.zeros(len(at.start) - 1)
-    if len(i) == 0:
-        return out
-    tree = cKDTree(at.xy)
-    for k, (end, length) in enumerate(zip(i, gap, strict=True)):
-        wide = AROUND * usual[row[end]]
-        near = np.array(tree.query_ball_point(middle[k], np.hypot(wide, 0.5 * length + 1)), dtype=int)
-        along, across = _seen_from(middle[k], outward[end], at.xy[near])
-        inside = (np.abs(along) < 0.5 * length + 1) & (np.abs(across) < wide)
-        inside &= np.abs(across) > 0.5 * usual[row[end]]
-        run = np.bincount(at.row[near[inside]], minlength=len(out)) * STEP
-        through = np.count_nonzero(run >= 0.9 * (length + 1))
-        along, across = _seen_from(middle[k], outward[end], middle)
-        broken = np.count_nonzero((np.abs(across) < wide) & (np.abs(along) < 0.5 * (length + gap))) / 2
-        out[row[end]] = max(out[row[end]], np.clip(2 * through / (through + max(broken, 1)) - 0.5, 0, 1))
-    return out
-
-
-def _aspect(at: _Stations, chm: Raster, normal: Values, usual: Values) -> Values:
-    """Width of rows' canopies (n,) over their height: what stands above half of it, within a spacing; NaN if unknown.
-
-    ``usual`` (stations,) is the spacing, NaN where there is no canopy.
-    """
-    known = np.flatnonzero(np.isfinite(usual))
-    offsets = np.linspace(-0.5, 0.5, 17)
-    out = np.full(len(at.start) - 1, np.nan)
-    if len(known) == 0:
-        return out
-    wide = normal[known] * usual[known, None]
-    heights = sample_across(chm, at.xy[known], wide, offsets)
-    top = np.where(np.isfinite(heights[:, 5:12]), heights[:, 5:12], -np.inf).max(axis=1)
-    top = np.where(np.isfinite(top), top, np.nan)
-    height = at.median(pd.Series(top, index=known).reindex(np.arange(len(at.row))).to_numpy())
-    seen = np.isfinite(heights)
-    above = (np.nan_to_num(heights) > 0.5 * height[at.row[known], None]).sum(axis=1)
-    width = above / np.maximum(seen.sum(axis=1), 1) * usual[known]
-    n = np.bincount(at.row[known], minlength=len(out))
-    mean = np.bincount(at.row[known], width, len(out)) / np.maximum(n, 1)
-    return np.where(n > 0, mean / height, np.nan)
-
-
-def _alike(lines: Values, aspect: Values) -> Values:
-    """How far rows (n,) are as wide for their height as those around, of ``aspect`` (n,): 1 to 1.5 times, 0 from 3."""
-    out = np.ones(len(lines))
-    middles = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
-    n = min(len(lines), 4 * LIKE)
-    if n < 3:
-        return out
-    candidates = cKDTree(middles).query(middles, n)[1][:, 1:]
-    away = shapely.distance(lines[:, None], lines[candidates])
-    nearest = np.take_along_axis(candidates, np.argsort(away, axis=1)[:, :LIKE], axis=1)
-    ratio = aspect / np.sort(aspect[nearest], axis=1)[:, 1]
-    return np.where(np.isfinite(ratio), np.clip(np.log(3 / np.maximum(ratio, 1e-3)) / np.log(2), 0, 1), 1)
-
-
-def _unclaimed(at: _Stations, beside: _Beside, usual: Values, cover: Raster, normal: Values, level: Values) -> Flags:
-    """Stations (n,) beside which canopy as strong as theirs stands where a next row would, and there is none."""
-    wide = normal * usual[at.row][:, None]
-    offsets = np.linspace(0.85, 1.15, 7)
-    out = np.zeros(len(at.row), dtype=bool)
-    for side, sign in enumerate((1, -1)):
-        there = np.nan_to_num(sample_across(cover, at.xy, sign * wide, offsets)).max(axis=1)
-        out |= (there > 0.6 * level[at.row]) & ~(beside.away[:, side] < UNUSUAL * usual[at.row])
-    return out
-
-
-def _cut(at: _Stations, usual: Values, cover: Raster, seen: Seen, normal: Values, level: Values) -> Values:
-    """Share of the canopy of rows (n,) that reaches, at a side, to where nothing is seen from there almost to a next.
-
-    Their ends lie at an edge by themselves. ``level`` (stations,) is the cover, NaN where there is no canopy.
-    """
-    inner = np.isfinite(level)
-    inner[at.start[:-1]] = inner[at.start[1:] - 1] = False
-    cut, step = np.zeros(len(at.row), dtype=bool), cover.grid.resolution
-    far = ASIDE * usual[at.row]
-    offsets = np.arange(0.0, float(far.max()), step)
-    for side in (normal, -normal):
-        k = np.flatnonzero(inner & ~seen.at(at.xy + far[:, None] * side))
-        xy = at.xy[k, None] + offsets[:, None] * side[k, None]
-        shown = (offsets <= far[k, None]) & seen.at(xy.reshape(-1, 2)).reshape(xy.shape[:2])
-        canopy = shown & (np.nan_to_num(sample_across(cover, at.xy[k], side[k], offsets)) > FLANK * level[k, None])
-        last, flank = ((offsets * flags).max(axis=1) for flags in (shown, canopy))
-        cut[k] |= flank >= last - seen.grid.resolution - step
-    return at.share(cut) / np.maximum(at.share(inner), 1e-9)

@@ -25,7 +25,16 @@ from vinemap.compute.beside import nearest_beside
 from vinemap.compute.links import parts_of
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
-from vinemap.surfaces.waves import COVER_RESOLUTION, LEAST_COVER, NEAR, Peaks, RowField, grain, scan_cylinders, scan_spectrum
+from vinemap.surfaces.waves import (
+    COVER_RESOLUTION,
+    LEAST_COVER,
+    NEAR,
+    Peaks,
+    RowField,
+    grain,
+    scan_cylinders,
+    scan_spectrum,
+)
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -91,8 +100,8 @@ def estimate_row_field(
     else:
         for second in others:
             way, clear = grain(base.values, peaks.direction.shape, step)
-            peaks, second = _with_the_grain(peaks, second, way, clear)
-            peaks, square = _one_way(peaks, second, clear < CLEAR, least=least)
+            waves = _with_the_grain(peaks, second, way, clear)
+            peaks, square = _one_way(*waves, clear < CLEAR, least=least)
     peaks = _settled(_axial_median(peaks), least=least)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
@@ -134,12 +143,17 @@ def _axial_median(peaks: Peaks) -> Peaks:
 
 
 def _with_the_grain(peaks: Peaks, second: Peaks, way: Values, clear: Values) -> tuple[Peaks, Peaks]:
-    """Let windows have the wave first that runs as the canopies do in their middle: a wall's or a hedge's may be
-    stronger, and where blocks meet the other block's."""
+    """Put that wave first, window by window, that runs as the canopies in its middle are drawn out.
+
+    That of a wall or a hedge at a window's edge may be stronger, and where blocks meet the other block's.
+    """
     off, other = (_axial(wave.direction, way) for wave in (peaks, second))
     turned = (clear >= CLEAR) & (second.strength > 0) & (other < off - ASKEW)
-    pairs = list(zip(peaks, second, strict=True))
-    return tuple(Peaks(*(np.where(turned, *pair[::sense]) for pair in pairs)) for sense in (-1, 1))
+    first, then = (
+        Peaks(*(np.where(turned, a, b) for a, b in zip(*waves, strict=True)))
+        for waves in ((second, peaks), (peaks, second))
+    )
+    return first, then
 
 
 def _one_way(peaks: Peaks, second: Peaks, either: Flags, *, least: float) -> tuple[Peaks, bool]:

@@ -98,9 +98,10 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
 
     The lateral mismatch is that of the ends from the tangents of both (the mean of the two vanishes on an arc) or that
     of the middles of their last metres from the row field's direction; the smaller counts. It stays below 0.25 m + 5%
-    of the gap and 0.36 spacings. Where rows beside it go on through the same bend, a gap may turn more than its row does
-    before and after: then its ends' tangents meet within it. ``beside(pieces, middle, way, length)`` tells how many go on, and
-    how many don't.
+    of the gap and 0.36 spacings.
+
+    Where the rows beside it go on through the same bend, a gap may turn more than its row does before and after: then
+    its ends' tangents meet within it. ``beside(pieces, middle, way, length)`` tells how many go on, and how many don't.
     """
     pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
     pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
@@ -120,7 +121,11 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
     fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
     aside = np.stack([_cross(ends.tangent[a], gap), _cross(gap, -ends.tangent[b])])
-    meet = (np.maximum(aside.min(axis=0), -aside.max(axis=0)) >= -gate) & (ahead >= BENT * length - OVERLAP) & (against > BENT)
+    meet = (
+        (np.maximum(aside.min(axis=0), -aside.max(axis=0)) >= -gate)
+        & (ahead >= BENT * length - OVERLAP)
+        & (against > BENT)
+    )
     for k in np.flatnonzero(meet & ~fits):
         middle = (ends.xy[a[k]] + ends.xy[b[k]]) / 2
         through, ended = beside(pairs[k] // 2, middle, ends.tangent[a[k]] - ends.tangent[b[k]], length[k])
@@ -136,9 +141,9 @@ def _cross(one: Values, other: Values) -> Values:
 
 
 def join(ends: Ends, pairs: Ints, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Ints:
-    """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2), but over no track.
+    """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2).
 
-    Each end is paired once.
+    Each end is paired once, and none over a track.
     """
     rows = np.arange(len(ends.spacing) // 2)
     taken, chosen = np.zeros(len(ends.spacing), dtype=bool), np.zeros(len(pairs), dtype=bool)
