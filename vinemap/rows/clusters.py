@@ -11,14 +11,14 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
-from vinemap.rows.joins import KINK, SHORT, STRIDE, TANGENT_LENGTH, candidates, ends_of, join
+from vinemap.rows.pieces.joins import candidates, ends_of, join
+from vinemap.rows.pieces.kinks import pieces_beside, torn_at_kinks
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 ALIGNED = 0.87
 """Cosine of the angle between two key points' rows up to which they may belong to one."""
-BESIDE, ASLANT, STRETCH = 4, 2.5, 3.5
-"""Rows on each side of a kink that are looked at, from so many metres before and after it, and over so many."""
 
 
 def cluster_rows(
@@ -85,9 +83,9 @@ def cluster_rows(
         return out.assign(cluster=pieces)
     position = _position_along(np.flatnonzero(kept), pieces, graph)
     tree = cKDTree(xy[kept])
-    pieces, position = _torn(tree, spacing[kept], pieces, position)
+    pieces, position = torn_at_kinks(tree, spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
-    beside = partial(_beside, tree, pieces=pieces, spacing=spacing[kept])
+    beside = partial(pieces_beside, tree, pieces=pieces, spacing=spacing[kept])
     rows = join(ends, candidates(ends, max_gap, beside), tree, track_width=track_width, cover=cover)
     return out.assign(cluster=rows[pieces])
 
@@ -186,68 +184,3 @@ def _position_along(points: Ints, pieces: Ints, graph: csr_array) -> Values:
     order = np.lexsort((way, pieces))
     last = np.searchsorted(pieces[order], np.arange(pieces.max() + 1), side="right") - 1
     return way_from(order[last])
-
-
-def _torn(tree: cKDTree, spacing: Values, pieces: Ints, position: Values) -> tuple[Ints, Values]:
-    """Pieces (n,) of a tree of key points and their places along them, torn at kinks where more rows end than go on.
-
-    There two blocks abut, at a track that narrows to nothing, and rows of both touch.
-    """
-    xy, pieces, position = tree.data, pieces.copy(), position.copy()
-    order = np.argsort(pieces, kind="stable")
-    first = np.searchsorted(pieces[order], np.arange(pieces.max() + 2))
-    for p in np.flatnonzero(np.diff(first)):
-        members = order[first[p] : first[p + 1]]
-        for s in reversed(_kinks(xy[members], position[members])):
-            middle, before, after = (
-                xy[members[np.abs(position[members] - at).argmin()]]
-                for at in (s, s - TANGENT_LENGTH, s + TANGENT_LENGTH)
-            )
-            own = pieces[members[:1]]
-            through, ended = _beside(tree, own, middle, after - before, pieces=pieces, spacing=spacing)
-            if ended > 2 * through:
-                beyond = members[position[members] > s]
-                pieces[beyond] = pieces.max() + 1
-                position[beyond] -= position[beyond].min()
-                members = members[position[members] <= s]
-    return pieces, position
-
-
-def _kinks(xy: Values, position: Values) -> Values:
-    """Metres along a piece (n, 2) at which it turns more than it bends before and after."""
-    k, least = round(TANGENT_LENGTH / STRIDE), round(SHORT / STRIDE)
-    order = np.argsort(position)
-    along = np.arange(0, position[order[-1]], STRIDE)
-    if len(along) <= 2 * least:
-        return np.empty(0)
-    curve = np.column_stack([np.interp(along, position[order], xy[order, axis]) for axis in (0, 1)])
-    here = np.arange(least, len(along) - least)
-    before, after = (
-        curve[here] - curve[np.maximum(here - k, 0)],
-        curve[np.minimum(here + k, len(along) - 1)] - curve[here],
-    )
-    turn = np.zeros(len(along))
-    turn[here] = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
-    padded = np.pad(turn, k)
-    sides = np.stack([padded[: -2 * k], padded[2 * k :]])
-    bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)
-    # Beside a kink it is a bend, and what is straight there no kink.
-    kink = np.minimum(np.abs(turn), np.abs(turn - bend))
-    out: Values = along[(kink > KINK) & (kink == maximum_filter1d(kink, 4 * k - 1))]
-    return out
-
-
-def _beside(
-    tree: cKDTree, own: Ints, middle: Values, way: Values, length: float = 0.0, *, pieces: Ints, spacing: Values
-) -> tuple[int, int]:
-    """How many pieces beside a gap of a length, or a kink, go on through it, and how many don't, of a tree of points.
-
-    A row that ends there and another that begins are two that don't.
-    """
-    past = max(length / 2, ASLANT)
-    reach = np.hypot(past + STRETCH, BESIDE * float(spacing[tree.query(middle)[1]]))
-    near = np.array(tree.query_ball_point(middle, reach), dtype=np.intp)
-    x = (tree.data[near] - middle) @ way / np.hypot(*way)
-    sides = [pieces[near[(sign * x >= past) & (sign * x <= past + STRETCH)]] for sign in (-1, 1)]
-    before, after = (set(side) - set(own.tolist()) for side in sides)
-    return len(before & after), len(before ^ after)

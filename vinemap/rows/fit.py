@@ -22,7 +22,7 @@ from vinemap.geo.curve import across, between, extend, normals, resample, way_al
 from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
-from vinemap.rows.joins import part_rows
+from vinemap.rows.parting import part_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
