@@ -163,7 +163,7 @@ def _scan(xy: Values, direction: Values, start: int, heading: Values, threshold:
         for k in range(len(xy)):
             x, y = xy[k, 0] - xy[here, 0], xy[k, 1] - xy[here, 1]
             ahead = x * heading[0] + y * heading[1]
-            if ahead <= 0 or abs(x * heading[1] - y * heading[0]) > 0.5 * ahead:
+            if ahead <= 0 or abs(x * heading[1] - y * heading[0]) > ahead:
                 continue
             if threshold <= ahead < least:
                 closest, least = k, ahead
