@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import binary_closing, binary_dilation, distance_transform_edt, label
+from scipy.ndimage import binary_closing, binary_dilation, binary_opening, distance_transform_edt, label
 
 from vinemap.compute.links import parts_of
 from vinemap.surfaces.waves import Peaks
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 AS_GOOD = 0.5
 """Strength of a second wave over that of the first from which both may be the rows'."""
+BROAD = 4
+"""Windows that a planting in a square has on each of its sides at the least: beside a hedge there are fewer."""
 EVEN, REGULAR = 0.1, 0.8
 """Share by which a planting's spacings may differ, and share of the waves that are so regular in each direction."""
 NEAR_WAY, EQUAL = np.radians(12), 1.05
@@ -65,9 +67,11 @@ def one_way(peaks: Peaks, second: Peaks, either: Flags, *, least: float) -> tupl
     """Give plantings in a square, where two directions are about as good, one a block; tell whether there are any.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
+    Only windows whose canopies aren't drawn out along ``either`` wave count.
     """
     both = either & (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
-    blocks, n = label(binary_closing(np.pad(both, 2), np.ones((3, 3)))[2:-2, 2:-2])
+    closed = binary_closing(np.pad(both, 2), np.ones((3, 3)))
+    blocks, n = label(binary_opening(closed, np.ones((BROAD, BROAD)))[2:-2, 2:-2])
     out, square = [values.copy() for values in peaks], False
     for k in range(1, n + 1):
         block = blocks == k
@@ -90,7 +94,7 @@ def one_way(peaks: Peaks, second: Peaks, either: Flags, *, least: float) -> tupl
         long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in (one, two)]
         alike = max(apart) < EQUAL * min(apart)
         chosen = (one, two)[int(np.argmax(long if alike else apart))]
-        around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
+        around = (block | (binary_dilation(block, np.ones((5, 5))) & either)) & (peaks.strength > 0)
         mine = around & (_axial(peaks.direction, chosen) < NEAR_WAY)
         other = around & ~mine & (second.strength > 0) & (_axial(second.direction, chosen) < NEAR_WAY)
         for values, second_values in zip(out, second, strict=True):
