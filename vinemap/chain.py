@@ -88,12 +88,13 @@ def map_rows(
     lines, remarks = (None, ()) if known is None else lines_here(known, seen, chm.crs)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
-    options["fit"]["high"] = settings.cover.high
+    for stage in ("clustering", "fit"):
+        options[stage]["high"] = settings.cover.high
     n_key_points = 0
     if lines is None:
         key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
         n_key_points = len(key_points)
-        clusters = step("Clusters", cluster_rows, key_points, cover, **options["clustering"])
+        clusters = step("Clusters", cluster_rows, key_points, cover, chm, **options["clustering"])
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
         del key_points, clusters  # much memory
     else:

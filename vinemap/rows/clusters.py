@@ -34,6 +34,7 @@ ALIGNED = 0.87
 def cluster_rows(
     key_points: gpd.GeoDataFrame,
     cover: Raster | None = None,
+    chm: Raster | None = None,
     *,
     method: str = "pieces",
     along: float = 1.0,
@@ -41,6 +42,7 @@ def cluster_rows(
     min_points: int = 6,
     max_gap: float = 20.0,
     track_width: float = 3.5,
+    high: float = 3.6,
 ) -> gpd.GeoDataFrame:
     """Label the key points of each row.
 
@@ -50,6 +52,8 @@ def cluster_rows(
         Points with ``direction_deg`` and ``spacing_m``.
     cover : Raster, optional
         Canopy cover 0–1, in which posts show that rows go on where all of them lack vines.
+    chm : Raster, optional
+        Canopy height in metres, which shows houses between rows.
     method : str
         "pieces" as described above; "ellipse" is the thesis's, for comparison: semi-axes of √(3 d) and √(0.5 d)
         metres (Eq. 4) and nothing joined.
@@ -61,6 +65,8 @@ def cluster_rows(
         Metres of missing vines that a row may bridge; 0 joins nothing.
     track_width : float
         Metres from which a gap that all rows beside it share is a track or a headland, where rows end.
+    high : float
+        Height in metres above which there are no vines.
 
     Returns
     -------
@@ -86,7 +92,8 @@ def cluster_rows(
     pieces, position = torn_at_kinks(tree, spacing[kept], pieces, position)
     ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
     beside = partial(pieces_beside, tree, pieces=pieces, spacing=spacing[kept])
-    rows = join(ends, candidates(ends, max_gap, beside), tree, track_width=track_width, cover=cover)
+    shown = {"cover": cover, "chm": chm}
+    rows = join(ends, candidates(ends, max_gap, beside), tree, track_width=track_width, high=high, **shown)
     return out.assign(cluster=rows[pieces])
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
 from vinemap.rows.pieces.kinks import KINK, SHORT, TANGENT_LENGTH
-from vinemap.rows.pieces.tracks import gaps_between, on_tracks
+from vinemap.rows.pieces.tracks import blocked, gaps_between, on_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -118,10 +118,19 @@ def _cross(one: Values, other: Values) -> Values:
     return out
 
 
-def join(ends: Ends, pairs: Ints, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Ints:
+def join(
+    ends: Ends,
+    pairs: Ints,
+    tree: cKDTree,
+    *,
+    track_width: float,
+    high: float,
+    cover: Raster | None = None,
+    chm: Raster | None = None,
+) -> Ints:
     """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2).
 
-    Each end is paired once, and none over a track.
+    Each end is paired once, and none over a track, or through what is taller than vines and longer than a tree.
     """
     rows = np.arange(len(ends.spacing) // 2)
     taken, chosen = np.zeros(len(ends.spacing), dtype=bool), np.zeros(len(pairs), dtype=bool)
@@ -132,7 +141,10 @@ def join(ends: Ends, pairs: Ints, tree: cKDTree, *, track_width: float, cover: R
             rows[rows == other] = one
     pairs = pairs[chosen]
     gaps = gaps_between(ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]], ends.spacing[pairs].mean(axis=1))
-    one, other = (pairs[~on_tracks(gaps, tree, track_width=track_width, cover=cover)] // 2).T
+    apart = on_tracks(gaps, tree, track_width=track_width, cover=cover)
+    if chm is not None:
+        apart |= blocked(gaps, chm, high=high)
+    one, other = (pairs[~apart] // 2).T
     return parts_of(len(rows), one, other)
 
 

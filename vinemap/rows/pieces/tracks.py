@@ -1,4 +1,4 @@
-"""Tracks and headlands told from missing vines: the gaps of neighbouring rows are judged as one."""
+"""Tracks, headlands and houses told from missing vines: the gaps of neighbouring rows are judged as one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
 from vinemap.compute.threads import in_threads
-from vinemap.geo.raster import sample_across
+from vinemap.geo.raster import sample, sample_across
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -47,6 +47,8 @@ LAST = 0.75
 """Metres beside a track within which a row's last post stands, and ``CLEAR`` inside."""
 POSTED = 0.2
 """Share of the gaps side by side with posts in them from which it is no track."""
+HOUSE = 2.0
+"""Spacings along a row over which what is taller than vines is no tree."""
 STRIDE = 0.5
 """Metres between the places at which ground is looked at."""
 
@@ -93,6 +95,18 @@ def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | 
         return lane if posts < max(min(2, len(lane)), POSTED * len(lane)) else lane[:0]
 
     out[wide[np.concatenate(in_threads(on_track, range(lanes.max() + 1)))]] = True
+    return out
+
+
+def blocked(gaps: Gaps, chm: Raster, *, high: float) -> Flags:
+    """Whether something stands in gaps (k,) that is taller than vines and longer than ``HOUSE``: a tree is shorter."""
+    step = chm.grid.resolution
+    out = np.zeros(len(gaps.length), dtype=bool)
+    for k in np.flatnonzero(gaps.length > HOUSE * gaps.spacing):
+        at = np.arange(-gaps.length[k] / 2, gaps.length[k] / 2, step)
+        tall = np.nan_to_num(sample(chm, gaps.middle[k] + at[:, None] * gaps.along[k])) > high
+        runs = find_objects(label(tall)[0])
+        out[k] = max((run.stop - run.start for (run,) in runs), default=0) * step > HOUSE * gaps.spacing[k]
     return out
 
 
