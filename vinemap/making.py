@@ -26,8 +26,8 @@ from vinemap.product.rasters import rasters_of, write_rasters
 from vinemap.product.record import record_of
 from vinemap.product.stac import write_item
 from vinemap.product.write import write_product
-from vinemap.rows.ends import beyond_ends
 from vinemap.rows.numbers import describe_rows
+from vinemap.rows.standing.gaps import beyond_ends
 
 if TYPE_CHECKING:
     from collections.abc import Callable

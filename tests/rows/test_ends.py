@@ -1,7 +1,7 @@
 import numpy as np
 
 from vinemap.rows.centre_line import CELL
-from vinemap.rows.ends import cut_to_canopy
+from vinemap.rows.standing.canopy import cut_to_canopy
 
 
 def test_a_wide_canopy_ends_where_its_middle_does():

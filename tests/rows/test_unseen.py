@@ -10,16 +10,16 @@ from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import Grid, Raster
-from vinemap.rows.ends import (
+from vinemap.rows.numbers import count_missing, estimate_vine_spacing, number_rows
+from vinemap.rows.standing.canopy import Standing
+from vinemap.rows.standing.gaps import (
     MISSING,
     OUTSIDE,
     SEEN,
     UNSEEN,
-    Standing,
     beyond_ends,
     lay_out,
 )
-from vinemap.rows.numbers import count_missing, estimate_vine_spacing, number_rows
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate

@@ -14,7 +14,8 @@ from vinemap.evaluate.planting import Edges, estimate_extent, estimate_spacing, 
 from vinemap.evaluate.trunks import known_spacing, with_known
 from vinemap.geo.curve import at, tangents
 from vinemap.geo.raster import sample_across
-from vinemap.rows.ends import MISSING, UNSEEN, thereabouts
+from vinemap.rows.standing.canopy import thereabouts
+from vinemap.rows.standing.gaps import MISSING, UNSEEN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -21,7 +21,7 @@ from vinemap import paths
 from vinemap.errors import InputError
 from vinemap.product.qgis.style import GREY, INK, RED, VIGOUR
 from vinemap.product.seasons.products import Product, read_products
-from vinemap.rows.ends import MISSING, UNSEEN
+from vinemap.rows.standing.gaps import MISSING, UNSEEN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -20,7 +20,7 @@ from matplotlib.colors import LightSource, LinearSegmentedColormap, Normalize
 from vinemap import paths
 from vinemap.product.gltf import read_glb
 from vinemap.product.qgis.style import CANOPY, GREY, HIGHEST_CANOPY, INK, LOWEST_CANOPY, RED, VIGOUR
-from vinemap.rows.ends import MISSING, UNSEEN
+from vinemap.rows.standing.gaps import MISSING, UNSEEN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.geo.crs import project
 from vinemap.geo.raster import block_sum, cell_of
-from vinemap.rows.ends import UNSEEN as NOT_SEEN
+from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
 from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:

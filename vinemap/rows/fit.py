@@ -21,8 +21,10 @@ from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import across, between, extend, normals, resample, way_along
 from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
-from vinemap.rows.ends import Known, Standing, cut_as_known, cut_to_canopy, find_canopy, lay_out
-from vinemap.rows.parting import part_rows
+from vinemap.rows.standing.canopy import Standing, cut_to_canopy, find_canopy
+from vinemap.rows.standing.gaps import lay_out
+from vinemap.rows.standing.known import Known, cut_as_known
+from vinemap.rows.standing.parting import part_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -100,7 +102,7 @@ def fit_rows(
         Heights from which points count as canopy: of its body for the centre line and the ends, of its ridge for the
         contrast, and for the centre line where canopies don't stand apart whole.
     dtm, seen, within
-        As for :func:`vinemap.rows.ends.lay_out`, which tells what is returned.
+        As for :func:`vinemap.rows.standing.gaps.lay_out`, which tells what is returned.
     high : float
         Height in metres up to which they do.
     smoothing : float

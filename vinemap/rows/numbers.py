@@ -11,7 +11,8 @@ import shapely
 from vinemap.compute.threads import in_threads
 from vinemap.geo.crs import WGS84, is_local, to_wgs84
 from vinemap.geo.main import Corner, Origin, to_main
-from vinemap.rows.ends import UNSEEN, USUAL
+from vinemap.rows.standing.canopy import USUAL
+from vinemap.rows.standing.gaps import UNSEEN
 
 if TYPE_CHECKING:
     from pyproj import CRS

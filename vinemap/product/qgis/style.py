@@ -23,8 +23,8 @@ from vinemap.product.qgis.symbology import (
     rgba,
     single,
 )
-from vinemap.rows.ends import MISSING
-from vinemap.rows.ends import UNSEEN as NOT_SEEN
+from vinemap.rows.standing.gaps import MISSING
+from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
-    from vinemap.rows.ends import Standing
+    from vinemap.rows.standing.canopy import Standing
 
 SHORT, STRIDE = 2.5, 0.5
 """Metres of a row that stand free at the least, and in which it is carried on."""
