@@ -15,7 +15,7 @@ from vinemap.geo.raster import sample
 from vinemap.rows.fit import fit_rows
 from vinemap.rows.known import follow_lines, name_rows
 from vinemap.rows.standing.canopy import Standing
-from vinemap.rows.standing.known import Known, cut_as_known
+from vinemap.rows.standing.known_ends import Known, cut_as_known
 from vinemap.surfaces.cover import canopy_cover
 from vinemap.surfaces.lines import USUAL, lines_here, space_lines
 from vinemap.surfaces.map import map_surfaces

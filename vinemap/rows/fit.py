@@ -23,7 +23,7 @@ from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.standing.canopy import Standing, cut_to_canopy, find_canopy
 from vinemap.rows.standing.gaps import lay_out
-from vinemap.rows.standing.known import Known, cut_as_known
+from vinemap.rows.standing.known_ends import Known, cut_as_known
 from vinemap.rows.standing.parting import part_rows
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ SHORTEST = 0.35
 OWN = 0.3
 """Share of a canopy across that must lie outside of another row's for it to tell where it ends."""
 ACROSS = 0.5
-"""Cover at the sides of what stands beyond a known end, in that of its middle, from which it runs across the row."""
+"""Cover at the sides of what stands beyond an end, in that of its middle, from which it runs across the row."""
 USUAL = 1.0
 """Metres between vines that are taken where nothing tells."""
 NOTHING = np.empty(0)
@@ -133,9 +133,21 @@ def cut_to_canopy(
     row = find_canopy(curve, image, ridge, end_share, theirs=theirs)
     if row is None:
         return None
-    first, last = row.runs[0, 0], row.runs[-1, 1]
+    runs = _along(row)
+    first, last = runs[0, 0], runs[-1, 1]
     goes_on = bool(first < USUAL), bool(last > way_along(curve)[-1] - USUAL)
-    return Standing(between(curve, first, last), row.runs - first, row.contrast, goes_on, half=row.half)
+    return Standing(between(curve, first, last), runs - first, row.contrast, goes_on, half=row.half)
+
+
+def _along(row: Standing) -> Values:
+    """Runs of a row's canopy without those beyond its ends that run across it, as a hedge does.
+
+    Where most of its canopy reaches to both sides none can be told.
+    """
+    if np.median(row.sides) > ACROSS / 2:
+        return row.runs
+    own = np.flatnonzero(row.sides <= ACROSS)
+    return row.runs[own[0] : own[-1] + 1]
 
 
 def _core(across: Values) -> slice:
