@@ -20,8 +20,8 @@ from vinemap.compute.compiled import compiled
 from vinemap.compute.filters import distance_to
 from vinemap.compute.threads import in_threads, strips
 from vinemap.geo.raster import Grid, Raster, block_sum, cell_of, cells_in, coarser, grid_over, nearest_cell, spread
-from vinemap.surfaces.flat import flat_things
 from vinemap.surfaces.statistics import LOWEST, height_about
+from vinemap.surfaces.things import flat_things, trees
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,8 +120,8 @@ def canopy_cover(
         Heights from which points count as canopy.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    flat = _grown(flat_things(chm, high), MARGIN, chm.grid.resolution)
-    top = height_about(replace(chm, values=np.where(flat, np.nan, chm.values)), high)
+    no_vines = _grown(flat_things(chm, high) | trees(chm, high), MARGIN, chm.grid.resolution)
+    top = height_about(replace(chm, values=np.where(no_vines, np.nan, chm.values)), high)
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
@@ -131,7 +131,7 @@ def canopy_cover(
     blocks = [block_sum(layer, k).astype(np.float32) for layer in counts]
     squares = Grid(grid.west, grid.north, side, *blocks[0].shape)
     about = _about(rows, squares)
-    things = spread(flat, chm.grid, squares) & ~about
+    things = spread(no_vines, chm.grid, squares) & ~about
     touching = closed = _closed(blocks[0], np.where(things, 0, blocks[1] + blocks[3]), side, TOUCHING)
     if touching.any():
         touching = closed & ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)

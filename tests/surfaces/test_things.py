@@ -5,7 +5,7 @@ import pytest
 from pyproj import CRS
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.surfaces.flat import flat_things
+from vinemap.surfaces.things import flat_things
 
 CELL = 0.25
 UTM = CRS.from_epsg(32632)

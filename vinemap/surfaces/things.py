@@ -1,4 +1,4 @@
-"""Things that are flat and compact, as cars and pallets are: no vines, however narrow they may be.
+"""Compact things that are no vines, however narrow they may be: flat ones, as cars and pallets are, and trees.
 
 Leaves are rough, but the tops of trimmed vines may be flat, too: what is as long as a row is left, and everything where
 much is flat.
@@ -13,7 +13,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import binary_dilation, label
 
 from vinemap.compute.threads import in_threads, strips
-from vinemap.surfaces.statistics import LOWEST
+from vinemap.geo.raster import coarser, spread
+from vinemap.surfaces.statistics import LOWEST, usual_height
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -27,6 +28,11 @@ LEAST, MOST = 0.25, 0.5
 """Square metres that are flat in one piece, and share of a thing that such pieces are."""
 LONG, FEW = 3.5, 0.5
 """Length of a thing in its own widths from which on it may be vines, and share of what stands that is flat, at most."""
+TALL, TALLER, TRUNK = 1.2, 1.5, 1.0
+"""Heights of things in that of the vines thereabouts from which on a place belongs to a tree and from which it tells
+one, and square metres of a tree that do."""
+ROUND = 2.0
+"""Length of a tree in its own widths, at most."""
 AROUND = np.ones((3, 3))
 """A cell and those beside it."""
 
@@ -68,6 +74,25 @@ def flat_things(chm: Raster, high: float) -> Flags:
     if size[flat].sum() <= FEW * len(of):
         out[standing] = flat[of]
     return out
+
+
+def trees(chm: Raster, high: float) -> Flags:
+    """Cells (ny, nx) of compact things that are far taller than the vines thereabouts, as trees among them are.
+
+    Parameters are as of :func:`flat_things`.
+    """
+    heights = np.nan_to_num(chm.values)
+    usual = spread(usual_height(chm, high), coarser(chm.grid, resolution=1.0), chm.grid)
+    above: Flags = (heights >= TALL * usual) & (usual >= LOWEST)
+    places, n = label(above, AROUND)
+    if n == 0:
+        return above
+    of = places[above] - 1
+    size = np.bincount(of)
+    trunk = np.bincount(of, (heights >= TALLER * usual)[above]) * chm.grid.resolution**2
+    lone = (trunk >= TRUNK) & (_length_in_widths(of, size, *np.nonzero(above)) < ROUND)
+    above[above] = lone[of]
+    return above
 
 
 def _length_in_widths(of: Ints, size: Ints, y: Ints, x: Ints) -> Values:
