@@ -108,7 +108,8 @@ def map_rows(
         free = follow_lines(lines, cover) if "keep" in _how(settings).values() else courses
         shift = measure_shift(lines, rows if free is courses else fit(free)[0], free["moves"].to_numpy())
         rows, options["judging"] = space_lines(rows, field), {"min_confidence": 0.0}
-    rows, gaps = believed(judge_rows(group_blocks(rows), cover, chm, field, seen), gaps, **options["judging"])
+    rows = judge_rows(group_blocks(rows), cover, chm, field, seen, high=settings.cover.high)
+    rows, gaps = believed(rows, gaps, **options["judging"])
     if lines is None:
         rows, gaps = number_rows(flag_rows(rows), gaps)
     else:

@@ -33,7 +33,9 @@ CUT = 2.0
 """Logarithm of the odds by which a row is less sure all of whose canopy is cut."""
 
 
-def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField, seen: Seen) -> gpd.GeoDataFrame:
+def judge_rows(
+    rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField, seen: Seen, *, high: float = 3.6
+) -> gpd.GeoDataFrame:
     """Give rows a ``confidence`` in 0–1, and the share of their canopy's length that is ``cut`` at a side.
 
     Confidence is the share of rows like it that are right, as far as a logistic model of what speaks for it tells it:
@@ -52,10 +54,12 @@ def judge_rows(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowFie
         As it was before rows were found.
     seen : Seen
         What the cloud shows.
+    high : float
+        Height in metres above which there are no vines.
     """
     if len(rows) == 0:
         return rows.assign(confidence=np.empty(0), cut=np.empty(0))
-    found = evidence(rows, cover, chm, field, seen)
+    found = evidence(rows, cover, chm, field, seen, high=high)
     odds = DOUBT + sum((weight * found[name].to_numpy() for name, weight in EVIDENCE.items()), np.zeros(len(rows)))
     return rows.assign(confidence=1 / (1 + np.exp(-odds)), cut=found["cut"].to_numpy())
 

@@ -10,7 +10,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap.compute.beside import nearest_beside
-from vinemap.geo.raster import Raster, sample_across
+from vinemap.geo.raster import Raster, sample, sample_across
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -83,7 +83,9 @@ class _Beside(NamedTuple):
     """Which; −1 where there is none."""
 
 
-def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField, seen: Seen) -> pd.DataFrame:
+def evidence(
+    rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField, seen: Seen, *, high: float
+) -> pd.DataFrame:
     """What speaks for rows, each from 0 to 1, and the share of their canopy's length that is ``cut`` at a side.
 
     They are **company**, the share of the length along which another row runs beside it at the distance that is usual
@@ -111,7 +113,7 @@ def evidence(rows: gpd.GeoDataFrame, cover: Raster, chm: Raster, field: RowField
     return pd.DataFrame(
         {
             "company": np.maximum(company, LONE * (1 - float(np.median(company)))),
-            "whole": 1 - np.maximum(_goes_on(at, usual, seen), _crosses(at, beside, usual)),
+            "whole": 1 - np.maximum(_goes_on(at, usual, chm, seen, high), _crosses(at, beside, usual)),
             "alike": _alike(lines, shape),
             "claimed": 1 - at.share(_unclaimed(at, beside, usual, cover, normal, level)),
             "support": np.minimum(rows["support"].to_numpy(dtype=float) / 0.6, 1),
@@ -171,10 +173,10 @@ def _crosses(at: _Stations, beside: _Beside, usual: Values) -> Values:
     return out
 
 
-def _goes_on(at: _Stations, usual: Values, seen: Seen) -> Values:
+def _goes_on(at: _Stations, usual: Values, chm: Raster, seen: Seen, high: float) -> Values:
     """How far rows (n,) end where another leads on and those around run through, from none of these to all.
 
-    What lies between must have been seen.
+    What lies between must have been seen, and nothing stand there that is taller than vines.
     """
     ends = np.column_stack([at.start[:-1], at.start[1:] - 1]).ravel()
     row = at.row[ends]
@@ -191,7 +193,7 @@ def _goes_on(at: _Stations, usual: Values, seen: Seen) -> Values:
     facing &= np.abs(across) < np.minimum(0.15 * usual[row[i]] + 0.03 * gap, 0.4 * usual[row[i]])
     i, gap = i[facing], gap[facing]
     middle = xy[i] + 0.5 * gap[:, None] * outward[i]
-    between = seen.at(middle)
+    between = seen.at(middle) & ~(sample(chm, middle) > high)
     i, gap, middle = i[between], gap[between], middle[between]
     out = np.zeros(len(at.start) - 1)
     if len(i) == 0:

@@ -52,10 +52,10 @@ TOUCHING = 1.4
 ENOUGH = 8
 """Points of a block that tell what it is; where there are fewer, those beside it help."""
 ABOUT = 6.0
-"""Metres about rows that touch in which rows are told by where they stand apart, unless they are narrow."""
+"""Metres about rows that touch in which rows are told by where they stand apart, unless they are narrow or lower."""
 PLANTS, BROAD, FEW = 0.25, 0.9, 0.2
 """Share of a block's points that are canopy where something grows, metres across which a row isn't narrow, and share of
-it that may be as broad all the same."""
+a row that may be as broad, or as high as those that touch, all the same."""
 FOOT, LEAST = 0.4, 0.2
 """Share of the canopies' height, and metres, from which low canopies are told from what grows beneath them."""
 RIDGE = 0.75
@@ -138,7 +138,7 @@ def canopy_cover(
     roofs = _roofs(chm, everything, body, grid, high)
     if about.any():
         roofs &= ~spread(about, squares, chm.grid)
-    apart = _apart(touching, closed, blocks[:2], squares, metres)
+    apart = _apart(touching, closed, blocks[:3], squares, metres)
     apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
     levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
     canopy = body
@@ -171,8 +171,9 @@ def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Val
 def _apart(touching: Flags, closed: Flags, counts: Sequence[Values], blocks: Grid, metres: Grid) -> Flags:
     """Cells of 1 m in which rows are told by where they stand apart: those where they touch, and those about them.
 
-    So a row is cut at one level all along. What is lower than those that touch and touches none of them keeps its
-    own. Counts are of all points in blocks of cells, of canopy's, and of those above where rows stand apart.
+    So a row is cut at one level all along. What touches none of those that touch keeps its own level if it is narrow,
+    or lower than they are. Counts are of all points in blocks of cells, of canopy, and of those above where rows stand
+    apart.
     """
     if not touching.any():
         return np.zeros(metres.shape, dtype=bool)
@@ -182,16 +183,21 @@ def _apart(touching: Flags, closed: Flags, counts: Sequence[Values], blocks: Gri
         out: Flags = np.bincount(cells[where], minlength=metres.ny * metres.nx).reshape(metres.shape) > 0
         return out
 
-    everything, plants = counts
+    everything, plants, high = counts
     held = _grown(any_of(touching), ABOUT, metres.resolution)
     growing = (plants > PLANTS * everything) & held.ravel()[cells]
-    apart = growing & ~_grown(closed, MARGIN, blocks.resolution)
-    parts = label(apart, np.ones((3, 3)))[0]
-    broad = _closed(everything, plants, blocks.resolution, BROAD)[apart]
-    narrow = apart.copy()
-    narrow[apart] = (np.bincount(parts[apart], broad) <= FEW * np.bincount(parts[apart]))[parts[apart]]
-    if narrow.any():
-        held &= distance_to(any_of(growing & ~narrow)) <= distance_to(any_of(narrow))
+    free = growing & ~_grown(closed, MARGIN, blocks.resolution)
+    if not free.any():
+        return held
+    part = label(free, np.ones((3, 3)))[0][free]
+    wide = _closed(everything, plants, blocks.resolution, BROAD)
+    broad, reaching = (
+        np.bincount(part, of[free]) > FEW * np.bincount(part) for of in (wide, high > PLANTS * everything)
+    )
+    own = np.zeros_like(free)
+    own[free] = ~(broad & reaching)[part]
+    if own.any():
+        held &= distance_to(any_of(growing & ~own)) <= distance_to(any_of(own))
     return held
 
 

@@ -31,8 +31,8 @@ LONG, FEW = 3.5, 0.5
 TALL, TALLER, TRUNK = 1.2, 1.5, 1.0
 """Heights of things in that of the vines thereabouts from which on a place belongs to a tree and from which it tells
 one, and square metres of a tree that do."""
-ROUND = 2.0
-"""Length of a tree in its own widths, at most."""
+ROUND, FULL = 2.0, 0.85
+"""Length of a tree in its own widths, at most, and share of its outline that it fills, at least."""
 AROUND = np.ones((3, 3))
 """A cell and those beside it."""
 
@@ -70,7 +70,7 @@ def flat_things(chm: Raster, high: float) -> Flags:
     of = label(standing, AROUND)[0][standing] - 1
     size = np.bincount(of)
     flat = np.bincount(of, smooth) >= MOST * size
-    flat &= _length_in_widths(of, size, *np.nonzero(standing)) < LONG
+    flat &= _shape(of, size, *np.nonzero(standing))[0] < LONG
     if size[flat].sum() <= FEW * len(of):
         out[standing] = flat[of]
     return out
@@ -90,15 +90,15 @@ def trees(chm: Raster, high: float) -> Flags:
     of = places[above] - 1
     size = np.bincount(of)
     trunk = np.bincount(of, (heights >= TALLER * usual)[above]) * chm.grid.resolution**2
-    lone = (trunk >= TRUNK) & (_length_in_widths(of, size, *np.nonzero(above)) < ROUND)
-    above[above] = lone[of]
+    length, full = _shape(of, size, *np.nonzero(above))
+    above[above] = ((trunk >= TRUNK) & (length < ROUND) & (full >= FULL))[of]
     return above
 
 
-def _length_in_widths(of: Ints, size: Ints, y: Ints, x: Ints) -> Values:
+def _shape(of: Ints, size: Ints, y: Ints, x: Ints) -> tuple[Values, Values]:
     """How many times as long as wide things are (m,), of which cells (n,) at rows and columns belong to each.
 
-    They are the sides of rectangles of the same second moments.
+    And which share of an ellipse of the same second moments they fill: rows that touch have alleys between them.
     """
 
     def mean(values: Values | Ints) -> Values:
@@ -108,7 +108,8 @@ def _length_in_widths(of: Ints, size: Ints, y: Ints, x: Ints) -> Values:
     xx, yy, xy = mean(x * x) - columns**2, mean(y * y) - rows**2, mean(x * y) - columns * rows
     half, apart = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     cell = 1 / 12  # the second moment of one cell
-    return np.sqrt((half + apart + cell) / np.maximum(half - apart + cell, cell))
+    most, least = half + apart + cell, np.maximum(half - apart + cell, cell)
+    return np.sqrt(most / least), size / (4 * np.pi * np.sqrt(most * least))
 
 
 def _roughness(around: Values, where: Flags) -> Values:
