@@ -246,3 +246,29 @@ def test_the_thesis_ellipse_finds_clean_rows_and_stops_at_gaps():
     points = key_points(rows)
     gap = (points["truth"] == 1) & points.geometry.x.between(15, 19)
     assert cluster_rows(points[~gap].reset_index(drop=True), method="ellipse")["cluster"].nunique() == 5
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_gap_at_a_bend_is_bridged_where_the_rows_beside_it_go_on(beside):
+    """Rows that turn by 24° at once, of which one lacks its vines there."""
+    turn = np.radians(24)
+    corner = [np.array([-2.5 * k * np.tan(turn / 2), 2.5 * k]) for k in range(5)]
+    way = np.array([np.cos(turn), np.sin(turn)])
+    points = key_points([np.array([c - [25, 0], c, c + 25 * way]) for c in corner])
+    from_corner = np.hypot(*(points.get_coordinates().to_numpy() - corner[2]).T)
+    lacking = (points["truth"] == 2) & (from_corner < 2.5)
+    points = points[~lacking & (beside | (points["truth"] == 2))].reset_index(drop=True)
+    found = cluster_rows(points)
+    assert found.groupby("truth")["cluster"].nunique().loc[2] == (1 if beside else 2)
+
+
+@pytest.mark.parametrize(("long", "rows"), [(8.0, 7), (3.0, 6)], ids=["house", "tree"])
+def test_rows_do_not_go_through_houses(long, rows):
+    lines = [np.array([[0, 2.5 * k], [50, 2.5 * k]]) for k in range(6)]
+    points = key_points(lines)
+    x = points.geometry.x
+    points = points[(points["truth"] != 2) | (np.abs(x - 25) > 5)].reset_index(drop=True)
+    grid = grid_over(np.array([0.0, -3.0]), np.array([50.0, 16.0]), resolution=0.25)
+    gx, gy = np.meshgrid(*grid.centres())
+    chm = Raster(np.where((np.abs(gx - 25) < long / 2) & (np.abs(gy - 5) < 2), 5.0, 0.0), grid, 32632)
+    assert cluster_rows(points, chm=chm)["cluster"].nunique() == rows

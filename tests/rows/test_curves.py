@@ -153,6 +153,20 @@ def test_ordering_with_gaps_and_any_sense_of_direction():
     assert ends == {tuple(line[0]), tuple(line[-1])}
 
 
+@pytest.mark.parametrize("radius", [3.0, 8.0])
+def test_key_points_are_ordered_around_a_bend_that_the_field_smooths(radius):
+    turn = np.linspace(0, 1.4, 60)
+    arc = radius * np.column_stack([np.sin(turn), 1 - np.cos(turn)])
+    way = np.array([np.cos(turn[-1]), np.sin(turn[-1])])
+    line = np.vstack(
+        [np.column_stack([np.arange(-15, 0, 0.3), np.zeros(50)]), arc, arc[-1] + np.outer(np.arange(1, 15, 0.3), way)]
+    )
+    along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    smooth = 1.4 / (1 + np.exp(-(along - along[80]) / 4))
+    ordered = order_key_points(line, smooth)
+    assert {tuple(p) for p in ordered[[0, -1]]} == {tuple(line[0]), tuple(line[-1])}
+
+
 def test_a_bush_as_long_as_a_row_is_none():
     """A row has free ground beside it."""
     bush = scene([np.array([[0, 0], [12.0, 0]])], width=1.5)

@@ -12,3 +12,17 @@ def test_a_wide_canopy_ends_where_its_middle_does():
     standing = cut_to_canopy(np.column_stack([x, 0 * x]), image, image, 0.6)
     assert standing is not None
     assert np.allclose(standing.curve[[0, -1], 0], [3, 17], atol=0.07)
+
+
+def test_a_hedge_across_the_end_is_no_vine():
+    x, offsets = np.arange(400) * CELL, np.arange(-24, 25) * CELL
+    vines = ((x > 3) & (x < 12) & ~((x > 7) & (x < 9)))[:, None] & (np.abs(offsets) < 0.3)
+    image = (vines | ((x > 13.5) & (x < 14.5))[:, None]).astype(float)
+    standing = cut_to_canopy(np.column_stack([x, 0 * x]), image, image, 0.6)
+    assert standing is not None
+    assert np.allclose(standing.curve[[0, -1], 0], [3, 12], atol=0.1)
+    assert not any(standing.goes_on)
+    wide = (((x > 3) & (x < 12)) | ((x > 13.5) & (x < 14.5)))[:, None] & (np.abs(offsets) < 3)
+    standing = cut_to_canopy(np.column_stack([x, 0 * x]), wide * 1.0, wide * 1.0, 0.6)
+    assert standing is not None
+    assert np.allclose(standing.curve[[0, -1], 0], [3, 14.5], atol=0.1)  # rows that touch all along

@@ -319,7 +319,7 @@ def test_a_meadow_has_no_rows(tmp_path):
     assert len(gpd.read_file(tmp_path / "truth.gpkg", layer="rows")) == 0
 
 
-@pytest.mark.parametrize("name", ["short", "single"])
+@pytest.mark.parametrize("name", ["short", "single", "contour", "kinked"])
 def test_families_vary_with_the_seed(name):
     one, same, other = family(name, 0), family(name, 0), family(name, 1)
     assert one.name == name

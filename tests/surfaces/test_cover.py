@@ -115,3 +115,17 @@ def test_nothing_flat_is_left_nor_raises_the_level(cloud, vines):
     inside = shapely.contains_xy(shapely.box(*(beside - [10, 2]), *(beside + [10, 2.2])), x, y)
     left = np.count_nonzero(cover.values[inside] > 0.12) * cover.grid.resolution**2
     assert left < 0.1 * sum(4 * np.prod(size) for size, _ in sizes)
+
+
+@pytest.mark.parametrize(("tall", "thick"), [(2.8, 0.8), (1.6, 0.75)], ids=["taller", "as high"])
+def test_rows_beside_a_hedge_keep_their_level(cloud, tall, thick):
+    rows = rows_of(5, length=25)
+    hedge = Vineyard("", [rows[4] + [0, 2.2]], tall, thick, bottom=0.0, dead=0)
+    vines = Vineyard("A", rows, height=1.8, dead=0)
+    survey = simulate([vines], hillside(0.05), beside=[hedge], weeds=0.1, density=300, seed=4)
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    cover, levels = canopy_cover(points, canopy_height_model(points))
+    assert levels.touching.any()  # the hedge seems to be rows that touch
+    usual, beside = (np.median(sample(cover, rows[k][20:-20])) for k in (1, 4))
+    assert beside > 0.9 * usual

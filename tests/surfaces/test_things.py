@@ -1,11 +1,11 @@
-"""What is flat and compact, and no vine."""
+"""What is compact and no vine: flat, or a tree."""
 
 import numpy as np
 import pytest
 from pyproj import CRS
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.surfaces.things import flat_things
+from vinemap.surfaces.things import flat_things, trees
 
 CELL = 0.25
 UTM = CRS.from_epsg(32632)
@@ -59,3 +59,39 @@ def test_leaves_are_rougher_than_the_ground():
 def test_nothing_stands():
     assert not flat(np.zeros((50, 50))).any()
     assert not flat(np.full((50, 50), np.nan)).any()
+
+
+def disc(heights, row, column, radius, tall):
+    """Raise a dome of leaves, in cells and metres; its cells that reach above the vines by half."""
+    i, j = np.indices(heights.shape)
+    up = tall * np.sqrt(np.maximum(1 - ((i - row) ** 2 + (j - column) ** 2) / (radius + 0.5) ** 2, 0))
+    np.maximum(heights, up, out=heights)
+    return up > 1.5 * 1.8
+
+
+def found_trees(heights):
+    return trees(Raster(heights, Grid(0.0, 0.0, CELL, *heights.shape), UTM), 3.6)
+
+
+@pytest.mark.parametrize("tall", [3.5, 5.0])
+def test_trees_among_rows_are_none_of_them(tall):
+    heights, _ = field()
+    tops = disc(heights, 31, 60, 6, tall) | disc(heights, 55, 150, 6, tall)
+    found = found_trees(heights)
+    assert found[tops].all()
+    assert not found[:, 75:130].any()
+
+
+def test_what_is_tall_and_long_is_no_tree():
+    """Rows of older vines, some of which touch, and a hedge."""
+    heights, rng = field()
+    heights[30:44] *= 1.6
+    heights[34:40, 60:110:6] = 2.7
+    heights[100:105, 10:190] = 3.0 + rng.normal(0, 0.2, (5, 180))
+    assert not found_trees(heights).any()
+
+
+def test_a_tree_by_itself_is_told_by_none():
+    heights = np.zeros((140, 200))
+    disc(heights, 70, 100, 8, 4.0)
+    assert not found_trees(heights).any()
