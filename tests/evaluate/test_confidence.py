@@ -15,7 +15,7 @@ SPACING = 2.5
 NO_GAPS = gpd.GeoDataFrame({"row": np.empty(0, dtype=int)}, geometry=[])
 
 
-def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=(), likelihood=0.7):
+def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=(), houses=(), likelihood=0.7):
     """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids."""
     table = {"spacing_m": np.full(len(lines), SPACING), "support": support, "contrast": contrast}
     rows = gpd.GeoDataFrame(table, geometry=[shapely.LineString(line) for line in lines], crs=32632)
@@ -33,6 +33,7 @@ def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0
             values[there] = h if tall else 1.0
         hidden = shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(x, y))
         values[hidden] = np.nan if tall else 0.0
+        values[shapely.contains_xy(shapely.union_all(list(houses)), *np.meshgrid(x, y))] = 5.0 if tall else 0.0
         rasters.append(Raster(values, grid, rows.crs))
     grid = rasters[0].grid
     shown = ~shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(*grid.centres()))
@@ -83,6 +84,14 @@ def test_what_wanders_where_there_is_no_wave_of_rows_is_none():
     assert judged([line])["confidence"].iloc[0] < 0.3
     assert judged(block(1), likelihood=0.2)["confidence"].iloc[0] < 0.3
     assert judged(block(5), likelihood=0.4)["confidence"].min() > 0.9
+
+
+def test_a_row_that_stops_at_a_house_is_whole():
+    rows = block(5)
+    pieces = [rows[2] * [0.4, 1], rows[2] * [0.4, 1] + [36, 0]]
+    lines = [*rows[:2], *rows[3:], *pieces]
+    assert judged(lines)["confidence"].iloc[-2:].max() < 0.8
+    assert judged(lines, houses=[shapely.box(25, 3, 35, 7)])["confidence"].iloc[-2:].min() > 0.9
 
 
 def test_rows_that_bend_are_as_sure():

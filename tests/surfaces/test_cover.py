@@ -117,11 +117,12 @@ def test_nothing_flat_is_left_nor_raises_the_level(cloud, vines):
     assert left < 0.1 * sum(4 * np.prod(size) for size, _ in sizes)
 
 
-@pytest.mark.parametrize(("tall", "thick"), [(2.8, 0.8), (1.6, 0.75)], ids=["taller", "as high"])
-def test_rows_beside_a_hedge_keep_their_level(cloud, tall, thick):
+@pytest.mark.parametrize(("tall", "half_width"), [(2.8, 0.27), (1.6, 0.27), (3.4, 0.45)])
+def test_rows_beside_a_hedge_keep_their_level(cloud, tall, half_width):
+    """They are lower, narrow, or both."""
     rows = rows_of(5, length=25)
-    hedge = Vineyard("", [rows[4] + [0, 2.2]], tall, thick, bottom=0.0, dead=0)
-    vines = Vineyard("A", rows, height=1.8, dead=0)
+    hedge = Vineyard("", [rows[4] + [0, 2.2]], tall, 0.8, bottom=0.0, dead=0)
+    vines = Vineyard("A", rows, height=1.8, half_width=half_width, dead=0)
     survey = simulate([vines], hillside(0.05), beside=[hedge], weeds=0.1, density=300, seed=4)
     points = PointCloud(survey.xyz, cloud.crs)
     points = points.above(terrain_model(points))

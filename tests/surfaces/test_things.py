@@ -83,11 +83,11 @@ def test_trees_among_rows_are_none_of_them(tall):
 
 
 def test_what_is_tall_and_long_is_no_tree():
-    """Rows of older vines, some of which touch, and a hedge."""
+    """Older vines in three rows that touch here and there, and a piece of a hedge."""
     heights, rng = field()
-    heights[30:44] *= 1.6
-    heights[34:40, 60:110:6] = 2.7
-    heights[100:105, 10:190] = 3.0 + rng.normal(0, 0.2, (5, 180))
+    heights[30:54, 60:90] *= 1.8
+    heights[30:54, 62:90:9] = 3.2
+    heights[75:79, 120:150] = 3.3 + rng.normal(0, 0.1, (4, 30))
     assert not found_trees(heights).any()
 
 

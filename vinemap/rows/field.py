@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from vinemap.compute.beside import nearest_beside
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
-from vinemap.rows.windows import CLEAR, axial_median, one_way, prescribed, settled, with_the_grain
+from vinemap.rows.windows import axial_median, one_way, prescribed, settled, with_the_grain
 from vinemap.surfaces.waves import (
     COVER_RESOLUTION,
     LEAST_COVER,
@@ -72,17 +72,17 @@ def estimate_row_field(
     """
     base = _block_mean(cover, COVER_RESOLUTION)
     band = (min_spacing, max_spacing)
-    scan, size = (scan_cylinders, radius) if method == "cylinders" else (scan_spectrum, window)
-    peaks, *others = scan(base.values, size, step, band)
     least = (window / 2 / step) ** 2
+    if method == "cylinders":
+        peaks = second = scan_cylinders(base.values, radius, step, band)
+    else:
+        drawn = grain(base.values, step)
+        peaks, second = with_the_grain(*scan_spectrum(base.values, window, step, band, drawn), drawn)
     square = False
     if row_direction is not None:
-        peaks = prescribed([peaks, *others], np.radians(row_direction))
-    else:
-        for second in others:
-            way, clear = grain(base.values, peaks.direction.shape, step)
-            waves = with_the_grain(peaks, second, way, clear)
-            peaks, square = one_way(*waves, clear < CLEAR, least=least)
+        peaks = prescribed([peaks, second], np.radians(row_direction))
+    elif method == "spectrum":
+        peaks, square = one_way(peaks, second, drawn, least=least)
     peaks = settled(axial_median(peaks), least=least)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION

@@ -8,10 +8,11 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation, binary_opening, distance_transform_edt, label
 
 from vinemap.compute.links import parts_of
-from vinemap.surfaces.waves import Peaks
+from vinemap.surfaces.waves import ASKEW, CLEAR, Peaks
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Values
+    from vinemap.surfaces.waves import Grain
 
 AS_GOOD = 0.5
 """Strength of a second wave over that of the first from which both may be the rows'."""
@@ -23,8 +24,6 @@ NEAR_WAY, EQUAL = np.radians(12), 1.05
 """Radians from a block's direction within which a wave has it, and ratio of spacings up to which they are alike."""
 ALIKE, LIKE_SPACING = np.radians(10), 1.15
 """Radians of turn, and ratio of spacings, up to which windows beside each other have the same wave."""
-CLEAR, ASKEW = 0.3, np.radians(15)
-"""How clearly canopies are drawn out in a direction that tells a wave, and radians by which it must be nearer."""
 FAR_STRONGER = 4.0
 """Strength of a block over that of windows which it may decide."""
 
@@ -49,13 +48,13 @@ def axial_median(peaks: Peaks) -> Peaks:
     return Peaks(np.where(empty, np.nan, direction), np.where(empty, np.nan, spacing), peaks.strength)
 
 
-def with_the_grain(peaks: Peaks, second: Peaks, way: Values, clear: Values) -> tuple[Peaks, Peaks]:
+def with_the_grain(peaks: Peaks, second: Peaks, drawn: Grain) -> tuple[Peaks, Peaks]:
     """Put that wave first, window by window, that runs as the canopies in its middle are drawn out.
 
     That of a wall or a hedge at a window's edge may be stronger, and where blocks meet the other block's.
     """
-    off, other = (_axial(wave.direction, way) for wave in (peaks, second))
-    turned = (clear >= CLEAR) & (second.strength > 0) & (other < off - ASKEW)
+    off, other = (drawn.off(wave.direction) for wave in (peaks, second))
+    turned = (second.strength > 0) & (other < off - ASKEW)
     first, then = (
         Peaks(*(np.where(turned, a, b) for a, b in zip(*waves, strict=True)))
         for waves in ((second, peaks), (peaks, second))
@@ -63,12 +62,13 @@ def with_the_grain(peaks: Peaks, second: Peaks, way: Values, clear: Values) -> t
     return first, then
 
 
-def one_way(peaks: Peaks, second: Peaks, either: Flags, *, least: float) -> tuple[Peaks, bool]:
+def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple[Peaks, bool]:
     """Give plantings in a square, where two directions are about as good, one a block; tell whether there are any.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
-    Only windows whose canopies aren't drawn out along ``either`` wave count.
+    Only windows whose canopies aren't drawn out along one wave count.
     """
+    either = drawn.clear < CLEAR
     both = either & (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
     closed = binary_closing(np.pad(both, 2), np.ones((3, 3)))
     blocks, n = label(binary_opening(closed, np.ones((BROAD, BROAD)))[2:-2, 2:-2])

@@ -33,7 +33,9 @@ PADDING = 2
 """Windows are zero-padded to this many times their width: the peak's position needs the finer bins."""
 HARMONICS = 3
 """Multiples of the wave's frequency that belong to the rows: canopies are narrower than a sine's crest."""
-EDGE, THERE = 0.35, 1.5
+CLEAR, ASKEW = 0.3, np.radians(15)
+"""How clearly canopies are drawn out in a direction that tells a wave, and radians by which that may be off."""
+EDGE, THERE = 0.35, 1.2
 """Metres: standard deviations of the Gaussians by which edges of canopies are told, and of what tells their grain."""
 BATCH = 16
 
@@ -46,36 +48,57 @@ class Peaks(NamedTuple):
     strength: Values
 
 
-def scan_spectrum(cover: Values, window: float, step: float, band: tuple[float, float]) -> list[Peaks]:
+class Grain(NamedTuple):
+    """Direction (my, mx) in radians along which canopy is drawn out, and how clearly, 0–1."""
+
+    direction: Values
+    clear: Values
+
+    def off(self, direction: Values) -> Values:
+        """Radians by which directions are off it; 0 where it isn't clear."""
+        turn = np.abs(np.angle(np.exp(2j * (direction - self.direction)))) / 2
+        out: Values = np.where(self.clear >= CLEAR, np.nan_to_num(turn), 0.0)
+        return out
+
+
+def scan_spectrum(
+    cover: Values, window: float, step: float, band: tuple[float, float], drawn: Grain
+) -> tuple[Peaks, Peaks]:
     """Strongest waves of the windows centred on a grid of nodes, node (0, 0) at the raster's corner, and the next ones.
 
-    The next are those in another direction, where the strongest don't hold most of a window's variance.
+    The next are those in another direction, where the strongest don't hold most of a window's variance, or don't run as
+    canopies are drawn out there.
     """
     windows, occupied, shape = _windows(cover, round(window / COVER_RESOLUTION / 2), step)
     hann = np.hanning(windows.shape[-1] + 1)[:-1]
     taper = (hann[:, None] * hann).astype(np.float32)
     batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    waves = in_threads(lambda batch: _strongest_wave(windows[*batch.T], taper, band), batches)
-    return _peaks(waves, occupied, shape)
+
+    def waves(batch: Ints) -> Values:
+        return _strongest_wave(windows[*batch.T], taper, band, Grain(*(values[*batch.T] for values in drawn)))
+
+    first, second = _peaks(in_threads(waves, batches), occupied, shape, sets=2)
+    return first, second
 
 
-def grain(cover: Values, shape: tuple[int, int], step: float) -> tuple[Values, Values]:
-    """Direction (my, mx) in radians along which canopy is drawn out about each node of a scan, and how clearly, 0–1.
+def grain(cover: Values, step: float) -> Grain:
+    """How canopy is drawn out about each node of a scan.
 
-    It is that of the structure tensor (Bigün & Granlund 1987), which a lone line beyond a few metres doesn't turn.
+    It is told by the structure tensor (Bigün & Granlund 1987), which a lone line beyond a few metres doesn't turn.
     """
-    stride = max(1, round(step / COVER_RESOLUTION))
+    stride, shape = _nodes(cover.shape, step)
     padded = np.pad(cover, [(0, max(0, (m - 1) * stride + 1 - n)) for m, n in zip(shape, cover.shape, strict=True)])
     south, east = (gaussian_filter(padded, EDGE / COVER_RESOLUTION, order=order) for order in ((1, 0), (0, 1)))
-    products = (east * east, south * south, east * south)
+    steep = np.maximum(np.hypot(east, south), 1e-6)
+    products = (east * east / steep, south * south / steep, east * south / steep)
     nodes = [gaussian_filter(p, THERE / COVER_RESOLUTION)[::stride, ::stride][: shape[0], : shape[1]] for p in products]
     xx, yy, xy = nodes
     # Rasters count rows southwards, and canopy lies across its gradient.
     direction = np.mod(np.arctan2(-2 * xy, xx - yy) / 2 + np.pi / 2, np.pi)
-    return direction, np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12)
+    return Grain(direction, np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12))
 
 
-def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> list[Peaks]:
+def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float, float]) -> Peaks:
     """Direction across which the histogram of the cover in a cylinder varies most, and the period of that histogram.
 
     The thesis scans cylinders so (section 2.3.1); its test, of Comba et al. (2015), is taken as the histogram's
@@ -112,7 +135,7 @@ def scan_cylinders(cover: Values, radius: float, step: float, band: tuple[float,
         return np.stack([angles[best], np.array(period) * COVER_RESOLUTION, np.clip(around[1], 0, 1)])
 
     batches = [occupied[start : start + BATCH] for start in range(0, len(occupied), BATCH)]
-    return _peaks([waves(batch) for batch in batches], occupied, shape)
+    return _peaks([waves(batch) for batch in batches], occupied, shape, sets=1)[0]
 
 
 def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple[int, int]]:
@@ -121,9 +144,8 @@ def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple
     They are a view: those of many nodes at once would take far more memory than the raster.
     """
     size = 2 * half
-    stride = max(1, round(step / COVER_RESOLUTION))
+    stride, (my, mx) = _nodes(cover.shape, step)
     # Windows reach over the edge by half their width; what lies there is no canopy.
-    my, mx = (n // stride + 2 for n in cover.shape)
     padded = np.zeros([(m - 1) * stride + size for m in (my, mx)], dtype=np.float32)
     padded[half : half + cover.shape[0], half : half + cover.shape[1]] = cover[
         : padded.shape[0] - half, : padded.shape[1] - half
@@ -134,9 +156,15 @@ def _windows(cover: Values, half: int, step: float) -> tuple[Values, Ints, tuple
     return windows, np.argwhere(canopy[::stride, ::stride][:my, :mx]), (my, mx)
 
 
-def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> list[Peaks]:
-    """Waves (3 or 6, k) of batches of windows, in their places."""
-    sets = len(waves[0]) // 3 if waves else 1
+def _nodes(shape: tuple[int, ...], step: float) -> tuple[int, tuple[int, int]]:
+    """Cells between a scan's nodes, and how many nodes there are (my, mx)."""
+    stride = max(1, round(step / COVER_RESOLUTION))
+    my, mx = (n // stride + 2 for n in shape)
+    return stride, (my, mx)
+
+
+def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int], *, sets: int) -> list[Peaks]:
+    """So many sets of waves (3 sets, k) of batches of windows, in their places."""
     out = np.zeros((sets, 3, *shape))
     out[:, :2] = np.nan
     if waves:
@@ -144,7 +172,7 @@ def _peaks(waves: Sequence[Values], occupied: Ints, shape: tuple[int, int]) -> l
     return [Peaks(*one) for one in out]
 
 
-def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -> Values:
+def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float], drawn: Grain) -> Values:
     """Direction (rad), spacing (m) and strength (0–1) of windows (k, size, size), and of the next waves, as (6, k)."""
     size = windows.shape[-1]
     wide = PADDING * size
@@ -156,12 +184,17 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float]) -
     first = np.stack(_strongest(power, np.zeros((2, len(power))), *how))
     second = np.zeros_like(first)
     second[1] = 1.0
-    weak = np.flatnonzero(first[2] < SURE)
+    weak = np.flatnonzero((first[2] < SURE) | (drawn.off(_across(first)) > ASKEW))
     if len(weak):
         second[:, weak] = _strongest(power[weak], np.ascontiguousarray(first[:2, weak]), *how)
-    # Rasters count rows southwards, so the wave vector points to (x, -y); rows lie across it.
-    waves = [(np.mod(np.arctan2(-y, x) + np.pi / 2, np.pi), 1 / np.hypot(x, y), s) for y, x, s in (first, second)]
-    return np.concatenate(waves)
+    return np.concatenate([(_across(wave), 1 / np.hypot(*wave[:2]), wave[2]) for wave in (first, second)])
+
+
+def _across(wave: Values) -> Values:
+    """Direction of rows (k,) in radians that lie across waves (≥2, k) of such a frequency in y and x."""
+    # Rasters count rows southwards, so the wave vector points to (x, -y).
+    out: Values = np.mod(np.arctan2(-wave[0], wave[1]) + np.pi / 2, np.pi)
+    return out
 
 
 @compiled
