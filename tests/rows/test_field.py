@@ -8,6 +8,7 @@ from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import Grid, Raster
 from vinemap.rows.field import estimate_row_field
+from vinemap.simulate.families import family
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate
@@ -118,3 +119,16 @@ def test_a_hedge_across_the_ends_turns_no_row(away, weak):
     x, _ = field.direction.grid.centres()
     rows = field.direction.values[24:-24, (np.abs(x - 1030) > 4.8) & (np.abs(x - 1030) < 18)]
     assert axial(rows, 0).max() < 5
+
+
+@pytest.mark.parametrize("seed", [5, 8])
+def test_heads_that_all_but_touch_tell_the_rows_of_a_square(seed):
+    """As far apart both ways, and columns of them as long as rows: only how the canopies are drawn out tells."""
+    survey = family("square", seed)
+    cloud = PointCloud(survey.xyz, survey.rows.crs)
+    cloud = cloud.above(terrain_model(cloud))
+    cover, _ = canopy_cover(cloud, canopy_height_model(cloud))
+    field = estimate_row_field(cover)
+    (ax, ay), (bx, by) = np.array(survey.rows.geometry.iloc[0].coords)[[0, -1], :2]
+    held = field.likelihood.values > 0.1
+    assert np.median(axial(field.direction.values[held], np.degrees(np.arctan2(by - ay, bx - ax)))) < 2

@@ -94,7 +94,7 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
         long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in (one, two)]
         alike = max(apart) < EQUAL * min(apart)
         chosen = (one, two)[int(np.argmax(long if alike else apart))]
-        around = (block | (binary_dilation(block, np.ones((5, 5))) & either)) & (peaks.strength > 0)
+        around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
         mine = around & (_axial(peaks.direction, chosen) < NEAR_WAY)
         other = around & ~mine & (second.strength > 0) & (_axial(second.direction, chosen) < NEAR_WAY)
         for values, second_values in zip(out, second, strict=True):
