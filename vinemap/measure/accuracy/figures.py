@@ -128,10 +128,10 @@ MESH_COLUMNS: Columns = {
         "told": Measure(lambda e: int(np.isfinite(e.told).sum()), np.inf, 0),
     },
     "mesh error m": {
-        "told": Measure(lambda e: mean(e.told[np.isfinite(e.told)]), np.inf),
-        "true": Measure(lambda e: mean(e.true[np.isfinite(e.told)]), np.inf),
-        "off": Measure(lambda e: mean((e.told - e.true)[np.isfinite(e.told)]), 0.01),
-        "worst row": Measure(lambda e: quantile(np.abs((e.told - e.true)[np.isfinite(e.told)]), 1), np.inf),
+        "told": Measure(lambda e: mean(e.told[e.both]), np.inf),
+        "true": Measure(lambda e: mean(e.true[e.both]), np.inf),
+        "off": Measure(lambda e: mean((e.told - e.true)[e.both]), 0.01),
+        "worst row": Measure(lambda e: quantile(np.abs((e.told - e.true)[e.both]), 1), np.inf),
     },
 }
 """Numbers of the table of meshes."""

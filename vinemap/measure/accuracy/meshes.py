@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from vinemap.canopy.model import CanopyModel
     from vinemap.chain import RowMap
-    from vinemap.compute.arrays import Floats, Ints
+    from vinemap.compute.arrays import Flags, Floats, Ints
     from vinemap.simulate.plants import Foliage
     from vinemap.simulate.survey import Survey
 
@@ -30,7 +30,13 @@ class MeshErrors(NamedTuple):
     told: Floats
     """``mesh_error_m`` (rows,), NaN where it isn't told."""
     true: Floats
-    """The same of the true surface (rows,), NaN where none is near."""
+    """The same of the true surface (rows,), NaN where none is near, as by a hedge."""
+
+    @property
+    def both(self) -> Flags:
+        """Which rows' errors are told and true."""
+        out: Flags = np.isfinite(self.told) & np.isfinite(self.true)
+        return out
 
 
 def compare_meshes(survey: Survey, found: RowMap, model: CanopyModel, *, step: float) -> MeshErrors:
