@@ -104,7 +104,10 @@ def blocked(gaps: Gaps, chm: Raster, *, high: float) -> Flags:
     out = np.zeros(len(gaps.length), dtype=bool)
     for k in np.flatnonzero(gaps.length > HOUSE * gaps.spacing):
         at = np.arange(-gaps.length[k] / 2, gaps.length[k] / 2, step)
-        tall = np.nan_to_num(sample(chm, gaps.middle[k] + at[:, None] * gaps.along[k])) > high
+        heights = sample(chm, gaps.middle[k] + at[:, None] * gaps.along[k])
+        if not (known := np.isfinite(heights)).any():
+            continue
+        tall = np.interp(at, at[known], heights[known]) > high
         runs = find_objects(label(tall)[0])
         out[k] = max((run.stop - run.start for (run,) in runs), default=0) * step > HOUSE * gaps.spacing[k]
     return out
