@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.simulate.families.common import block, survey_of
+from vinemap.simulate.families.blocks import block, survey_of
 from vinemap.simulate.matching import Matching
 from vinemap.simulate.terrain import PLACE
 from vinemap.simulate.yard import POSTS, place, posts

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from shapely.ops import substring
 
-from vinemap.simulate.families.common import block, survey_of
+from vinemap.simulate.families.blocks import block, survey_of
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Sheet
 from vinemap.simulate.scenes import rows_of

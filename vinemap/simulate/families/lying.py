@@ -10,7 +10,7 @@ import shapely
 import shapely.affinity
 from scipy.interpolate import PchipInterpolator
 
-from vinemap.simulate.families.common import beyond, block, survey_of
+from vinemap.simulate.families.blocks import beyond, block, survey_of
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.terrain import PLACE, hillside, terraced
 from vinemap.simulate.yard import place

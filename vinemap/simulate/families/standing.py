@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.simulate.families.common import survey_of
+from vinemap.simulate.families.blocks import survey_of
 from vinemap.simulate.families.growing import PLANTED_THIS_YEAR
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.simulate.families.common import block, survey_of
+from vinemap.simulate.families.blocks import block, survey_of
 from vinemap.simulate.families.flown import matched, matched_poorly
 from vinemap.simulate.families.growing import (
     BEFORE_FLOWERING,

@@ -1,4 +1,4 @@
-"""What families of vineyards have in common: blocks of rows, and surveys of them."""
+"""Blocks of rows, and surveys of them that are as they often are but for what a family gives."""
 
 from __future__ import annotations
 
