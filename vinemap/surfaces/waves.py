@@ -86,13 +86,22 @@ def grain(cover: Values, step: float) -> Grain:
 
     It is told by the structure tensor (Bigün & Granlund 1987), which a lone line beyond a few metres doesn't turn.
     """
-    stride, shape = _nodes(cover.shape, step)
-    padded = np.pad(cover, [(0, max(0, (m - 1) * stride + 1 - n)) for m, n in zip(shape, cover.shape, strict=True)])
-    south, east = (gaussian_filter(padded, EDGE / COVER_RESOLUTION, order=order) for order in ((1, 0), (0, 1)))
-    steep = np.maximum(np.hypot(east, south), 1e-6)
-    products = (east * east / steep, south * south / steep, east * south / steep)
-    nodes = [gaussian_filter(p, THERE / COVER_RESOLUTION)[::stride, ::stride][: shape[0], : shape[1]] for p in products]
-    xx, yy, xy = nodes
+    stride, (my, mx) = _nodes(cover.shape, step)
+    beyond = [(0, max(0, (m - 1) * stride + 1 - n)) for m, n in zip((my, mx), cover.shape, strict=True)]
+    padded = np.pad(cover.astype(np.float32), beyond)
+
+    def edges(order: tuple[int, int]) -> Values:
+        out: Values = gaussian_filter(padded, EDGE / COVER_RESOLUTION, order=order)
+        return out
+
+    def about(pair: tuple[Values, Values]) -> Values:
+        blurred = gaussian_filter(pair[0] * pair[1] / steep, THERE / COVER_RESOLUTION)
+        out: Values = blurred[::stride, ::stride][:my, :mx].astype(np.float64)
+        return out
+
+    south, east = in_threads(edges, [(1, 0), (0, 1)])
+    steep = np.maximum(np.hypot(east, south), np.float32(1e-6))
+    xx, yy, xy = in_threads(about, [(east, east), (south, south), (east, south)])
     # Rasters count rows southwards, and canopy lies across its gradient.
     direction = np.mod(np.arctan2(-2 * xy, xx - yy) / 2 + np.pi / 2, np.pi)
     return Grain(direction, np.hypot(xx - yy, 2 * xy) / np.maximum(xx + yy, 1e-12))
