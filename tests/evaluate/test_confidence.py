@@ -15,7 +15,19 @@ SPACING = 2.5
 NO_GAPS = gpd.GeoDataFrame({"row": np.empty(0, dtype=int)}, geometry=[])
 
 
-def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0, voids=(), houses=(), likelihood=0.7):
+def judged(
+    lines,
+    *,
+    standing=(),
+    wide=0.5,
+    high=1.9,
+    support=0.95,
+    contrast=1.0,
+    voids=(),
+    houses=(),
+    likelihood=0.7,
+    plain=0.0,
+):
     """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids."""
     table = {"spacing_m": np.full(len(lines), SPACING), "support": support, "contrast": contrast}
     rows = gpd.GeoDataFrame(table, geometry=[shapely.LineString(line) for line in lines], crs=32632)
@@ -37,7 +49,8 @@ def judged(lines, *, standing=(), wide=0.5, high=1.9, support=0.95, contrast=1.0
         rasters.append(Raster(values, grid, rows.crs))
     grid = rasters[0].grid
     shown = ~shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(*grid.centres()))
-    field = RowField(*(Raster(np.full(grid.shape, value), grid, rows.crs) for value in (0.0, SPACING, likelihood)))
+    told = [Raster(np.full(grid.shape, value), grid, rows.crs) for value in (0.0, SPACING, likelihood, plain)]
+    field = RowField(*told[:3], plain=told[3])
     rows = judge_rows(group_blocks(rows), *rasters, field, Seen(shown, grid, shown, grid))
     return flag_rows(rows)
 
@@ -83,6 +96,7 @@ def test_what_wanders_where_there_is_no_wave_of_rows_is_none():
     line = np.column_stack([x, np.sin(x)])
     assert judged([line])["confidence"].iloc[0] < 0.3
     assert judged(block(1), likelihood=0.2)["confidence"].iloc[0] < 0.3
+    assert judged(block(1), likelihood=0.1, plain=0.8)["confidence"].iloc[0] > 0.5
     assert judged(block(5), likelihood=0.4)["confidence"].min() > 0.9
 
 
@@ -94,10 +108,12 @@ def test_a_row_that_stops_at_a_house_is_whole():
     assert judged(lines, houses=[shapely.box(25, 3, 35, 7)])["confidence"].iloc[-2:].min() > 0.9
 
 
-def test_rows_that_bend_are_as_sure():
+@pytest.mark.parametrize(("spacing", "radius"), [(2.5, 8.0), (5.0, 9.0)])
+def test_rows_that_bend_are_as_sure(spacing, radius):
     turn = np.linspace(-1, 1, 121)
-    bent = [np.column_stack([30 + r * np.sin(turn), 15 - r * np.cos(turn)]) for r in (8.0, 10.5, 13.0)]
-    assert judged(bent)["confidence"].min() > 0.9
+    radii = radius + spacing * np.arange(3)
+    bent = [np.column_stack([30 + r * np.sin(turn), 16 - r * np.cos(turn)]) for r in radii]
+    assert judged(bent)["confidence"].min() > 0.85
 
 
 def test_a_row_that_stops_where_others_run_through_is_a_piece_of_one():

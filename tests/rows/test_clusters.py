@@ -262,7 +262,7 @@ def test_a_gap_at_a_bend_is_bridged_where_the_rows_beside_it_go_on(beside):
     assert found.groupby("truth")["cluster"].nunique().loc[2] == (1 if beside else 2)
 
 
-@pytest.mark.parametrize(("long", "rows"), [(8.0, 7), (3.0, 6)], ids=["house", "tree"])
+@pytest.mark.parametrize(("long", "rows"), [(8.0, 7), (6.0, 6)], ids=["house", "tree"])
 def test_rows_do_not_go_through_houses(long, rows):
     lines = [np.array([[0, 2.5 * k], [50, 2.5 * k]]) for k in range(6)]
     points = key_points(lines)

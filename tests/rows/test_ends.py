@@ -22,6 +22,10 @@ def test_a_hedge_across_the_end_is_no_vine():
     assert standing is not None
     assert np.allclose(standing.curve[[0, -1], 0], [3, 12], atol=0.1)
     assert not any(standing.goes_on)
+    broad = (vines | ((x > 13.5) & (x < 19))[:, None]).astype(float)
+    standing = cut_to_canopy(np.column_stack([x, 0 * x]), broad, broad, 0.6)
+    assert standing is not None
+    assert np.allclose(standing.curve[[0, -1], 0], [3, 19], atol=0.1)  # longer than a hedge is thick
     wide = (((x > 3) & (x < 12)) | ((x > 13.5) & (x < 14.5)))[:, None] & (np.abs(offsets) < 3)
     standing = cut_to_canopy(np.column_stack([x, 0 * x]), wide * 1.0, wide * 1.0, 0.6)
     assert standing is not None

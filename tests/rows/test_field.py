@@ -132,3 +132,22 @@ def test_heads_that_all_but_touch_tell_the_rows_of_a_square(seed):
     (ax, ay), (bx, by) = np.array(survey.rows.geometry.iloc[0].coords)[[0, -1], :2]
     held = field.likelihood.values > 0.1
     assert np.median(axial(field.direction.values[held], np.degrees(np.arctan2(by - ay, bx - ax)))) < 2
+
+
+@pytest.mark.parametrize("direction", [0, 2, 20, 48, 90])
+def test_a_lone_row_shows_by_its_grain(direction):
+    whole = stripes(direction, 200.0)
+    field = estimate_row_field(whole)
+    on_row = field.likelihood.values > 0.1
+    assert np.median(axial(field.direction.values[on_row], direction)) < 10
+    assert np.median(field.plain.values[on_row]) > 0.6
+
+
+def test_a_square_shows_in_any_direction_that_is_prescribed():
+    x, y = np.meshgrid(np.arange(0, 40, 0.1), np.arange(0, 40, 0.1))
+    bushes = np.hypot((x + 1.0) % 2.0 - 1.0, (y + 1.0) % 2.0 - 1.0) < 0.4
+    cover = Raster(bushes.astype(np.float32), Grid(0.0, 40.0, 0.1, 400, 400), UTM)
+    for told in (None, 0.0, 90.0):
+        field = estimate_row_field(cover, row_direction=told)
+        assert field.square is (told is None)
+        assert field.plain.values[30:50, 30:50].min() == 1

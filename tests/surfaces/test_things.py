@@ -91,6 +91,14 @@ def test_what_is_tall_and_long_is_no_tree():
     assert not found_trees(heights).any()
 
 
+def test_old_vines_among_young_ones_are_no_trees():
+    heights, _ = field()
+    heights *= 0.4
+    for column in range(30, 180, 25):
+        disc(heights, 32, column, 4, 1.9)
+    assert not found_trees(heights).any()
+
+
 def test_a_tree_by_itself_is_told_by_none():
     heights = np.zeros((140, 200))
     disc(heights, 70, 100, 8, 4.0)

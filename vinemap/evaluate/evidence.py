@@ -35,6 +35,8 @@ TANGENT = 5.0
 """Metres of a row that tell where it would go on."""
 LONGEST_GAP = 40.0
 """Metres over which one row may go on in another."""
+THROUGH = np.arange(0.05, 1, 0.1)
+"""Shares of a gap at which it is looked for what is taller than vines."""
 AROUND = 3.5
 """Spacings within which other rows tell whether there is a track."""
 LIKE = 4
@@ -48,8 +50,12 @@ RIDGE, FLANK = 0.35, 0.2
 
 FAINT, PLAIN = 0.15, 0.35
 """Likelihood of a row field that tells no rows, and from which on it tells them."""
-SMOOTH, CROOKED = 0.35, 0.6
-"""Root mean square turn of a row in radians a spacing, up to which rows bend, and from which what is found wanders."""
+BLURRED, CLEAR = 0.3, 0.6
+"""The same of how clearly rows show without a wave."""
+SMOOTH, CROOKED = 0.04, 0.1
+"""Radians a metre by which a row's turn varies up to which it bends, and from which what is found wanders."""
+BEND = 10.0
+"""Metres over which rows bend alike."""
 CHORD = 2.0
 """Metres between which a row's turn is told."""
 
@@ -120,7 +126,7 @@ def evidence(
             "contrast": np.clip((rows["contrast"].to_numpy(dtype=float) - 0.2) / 0.6, 0, 1),
             "length": 1 - np.exp(-shapely.length(lines) / (2 * usual)),
             "wave": _wave(at, field),
-            "smooth": np.clip((CROOKED - _turn(at, usual)) / (CROOKED - SMOOTH), 0, 1),
+            "smooth": np.clip((CROOKED - _wandering(at)) / (CROOKED - SMOOTH), 0, 1),
             "cut": _cut(at, usual, cover, seen, normal, np.where(standing, level[at.row], np.nan)),
         }
     )
@@ -193,7 +199,9 @@ def _goes_on(at: _Stations, usual: Values, chm: Raster, seen: Seen, high: float)
     facing &= np.abs(across) < np.minimum(0.15 * usual[row[i]] + 0.03 * gap, 0.4 * usual[row[i]])
     i, gap = i[facing], gap[facing]
     middle = xy[i] + 0.5 * gap[:, None] * outward[i]
-    between = seen.at(middle) & ~(sample(chm, middle) > high)
+    along = xy[i, None] + (THROUGH * gap[:, None])[..., None] * outward[i, None]
+    tall = sample(chm, along.reshape(-1, 2)).reshape(along.shape[:2]) > high
+    between = seen.at(middle) & ~tall.any(axis=1)
     i, gap, middle = i[between], gap[between], middle[between]
     out = np.zeros(len(at.start) - 1)
     if len(i) == 0:
@@ -262,25 +270,33 @@ def _unclaimed(at: _Stations, beside: _Beside, usual: Values, cover: Raster, nor
 
 
 def _wave(at: _Stations, field: RowField) -> Values:
-    """How plainly rows (n,) lie in a wave of rows; where vines stand in a square there are two, and all do."""
-    if field.square:
-        return np.ones(len(at.start) - 1)
+    """How plainly rows (n,) lie in a wave of rows, or show without one."""
     likelihood = at.share(np.nan_to_num(field.at(at.xy)[2]))
     out: Values = np.clip((likelihood - FAINT) / (PLAIN - FAINT), 0, 1)
+    if field.plain:
+        alone = at.share(np.nan_to_num(sample(field.plain, at.xy)))
+        out = np.maximum(out, np.clip((alone - BLURRED) / (CLEAR - BLURRED), 0, 1))
     return out
 
 
-def _turn(at: _Stations, usual: Values) -> Values:
-    """Root mean square turn of rows (n,) in radians a spacing: between chords of ``CHORD`` metres, a station apart."""
-    k, n = round(CHORD / STEP), len(at.row)
-    first = np.arange(max(n - k - 1, 0))
-    one = at.row[first] == at.row[first + k + 1]
-    way = at.xy[first[one, None] + [k, k + 1]] - at.xy[first[one, None] + [0, 1]]
-    a, b = way[:, 0], way[:, 1]
+def _wandering(at: _Stations) -> Values:
+    """Root mean square of how far rows' (n,) turn between two stations is off what it is thereabouts, radians a metre.
+
+    It is told by chords of ``CHORD`` metres.
+    """
+    k = round(CHORD / STEP)
+    first = np.arange(max(len(at.row) - k - 1, 0))
+    first = first[at.row[first] == at.row[first + k + 1]]
+    a, b = at.xy[first + k] - at.xy[first], at.xy[first + k + 1] - at.xy[first + 1]
     turn = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1)) / STEP
-    row = at.row[first[one]]
-    square = np.bincount(row, turn**2, len(usual)) / np.maximum(np.bincount(row, minlength=len(usual)), 1)
-    out: Values = np.sqrt(square) * usual
+    row, rows = at.row[first], len(at.start) - 1
+    total = np.concatenate([[0.0], np.cumsum(turn)])
+    n = np.bincount(row, minlength=rows)
+    begin = np.concatenate([[0], np.cumsum(n)])
+    here, reach = np.arange(len(turn)), round(BEND / STEP / 2)
+    low, high = np.maximum(here - reach, begin[row]), np.minimum(here + reach + 1, begin[row + 1])
+    off = turn - (total[high] - total[low]) / (high - low)
+    out: Values = np.sqrt(np.bincount(row, off**2, rows) / np.maximum(n, 1))
     return out
 
 

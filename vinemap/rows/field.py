@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from vinemap.compute.beside import nearest_beside
 from vinemap.geo.curve import at
 from vinemap.geo.raster import Grid, Raster, coarser
-from vinemap.rows.windows import axial_median, one_way, prescribed, settled, with_the_grain
+from vinemap.rows.windows import axial_median, one_way, prescribed, settled, shown, with_the_grain
 from vinemap.surfaces.waves import (
     COVER_RESOLUTION,
     LEAST_COVER,
@@ -73,20 +73,22 @@ def estimate_row_field(
     base = _block_mean(cover, COVER_RESOLUTION)
     band = (min_spacing, max_spacing)
     least = (window / 2 / step) ** 2
+    drawn = grain(base.values, step)
+    waves: tuple[Peaks, ...]
     if method == "cylinders":
-        peaks = second = scan_cylinders(base.values, radius, step, band)
+        waves = (scan_cylinders(base.values, radius, step, band),)
+        peaks, square = waves[0], np.zeros_like(drawn.clear, dtype=bool)
     else:
-        drawn = grain(base.values, step)
-        peaks, second = with_the_grain(*scan_spectrum(base.values, window, step, band, drawn), drawn)
-    square = False
+        waves = with_the_grain(*scan_spectrum(base.values, window, step, band, drawn), drawn)
+        peaks, square = one_way(*waves, drawn, least=least)
     if row_direction is not None:
-        peaks = prescribed([peaks, second], np.radians(row_direction))
-    elif method == "spectrum":
-        peaks, square = one_way(peaks, second, drawn, least=least)
+        peaks = prescribed(waves, np.radians(row_direction))
     peaks = settled(axial_median(peaks), least=least)
+    plain = shown(peaks, drawn, square)
     grid = coarser(cover.grid, resolution=FIELD_RESOLUTION)
     stride = max(1, round(step / COVER_RESOLUTION)) * COVER_RESOLUTION
-    return replace(_resample(peaks, grid, base.grid, stride, cover), square=square)
+    field = _resample(peaks, plain, grid, base.grid, stride, cover)
+    return replace(field, square=row_direction is None and bool(square.any()))
 
 
 def _block_mean(raster: Raster, resolution: float) -> Raster:
@@ -103,7 +105,7 @@ def _block_mean(raster: Raster, resolution: float) -> Raster:
     return Raster(mean, grid, raster.crs)
 
 
-def _resample(peaks: Peaks, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:
+def _resample(peaks: Peaks, plain: Values, grid: Grid, base: Grid, step: float, cover: Raster) -> RowField:
     """Bring the waves of the windows to a raster, weighted by their strength."""
     x, y = grid.centres()
     i, j = np.meshgrid((base.north - y) / step, (x - base.west) / step, indexing="ij")
@@ -126,7 +128,10 @@ def _resample(peaks: Peaks, grid: Grid, base: Grid, step: float, cover: Raster) 
         return Raster(values, grid, cover.crs)
 
     return RowField(
-        raster(np.where(known, direction, np.nan)), raster(np.where(known, spacing, np.nan)), raster(likelihood)
+        raster(np.where(known, direction, np.nan)),
+        raster(np.where(known, spacing, np.nan)),
+        raster(likelihood),
+        plain=raster(at(plain)),
     )
 
 
@@ -168,6 +173,7 @@ def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
         replace(field.spacing, values=np.where(known, spacing[nearest], field.spacing.values)),
         field.likelihood,
         field.square,
+        field.plain,
     )
 
 

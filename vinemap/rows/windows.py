@@ -11,13 +11,15 @@ from vinemap.compute.links import parts_of
 from vinemap.surfaces.waves import ASKEW, CLEAR, Peaks
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from vinemap.compute.arrays import Flags, Values
     from vinemap.surfaces.waves import Grain
 
 AS_GOOD = 0.5
 """Strength of a second wave over that of the first from which both may be the rows'."""
-BROAD = 4
-"""Windows that a planting in a square has on each of its sides at the least: beside a hedge there are fewer."""
+LONE, WEAK = 0.6, 0.3
+"""How clearly a lone row is drawn out, and strength that a wave has where it is none."""
 EVEN, REGULAR = 0.1, 0.8
 """Share by which a planting's spacings may differ, and share of the waves that are so regular in each direction."""
 NEAR_WAY, EQUAL = np.radians(12), 1.05
@@ -51,7 +53,8 @@ def axial_median(peaks: Peaks) -> Peaks:
 def with_the_grain(peaks: Peaks, second: Peaks, drawn: Grain) -> tuple[Peaks, Peaks]:
     """Put that wave first, window by window, that runs as the canopies in its middle are drawn out.
 
-    That of a wall or a hedge at a window's edge may be stronger, and where blocks meet the other block's.
+    That of a wall or a hedge at a window's edge may be stronger, and where blocks meet the other block's. A lone row
+    has hardly any: the grain is its direction.
     """
     off, other = (drawn.off(wave.direction) for wave in (peaks, second))
     turned = (second.strength > 0) & (other < off - ASKEW)
@@ -59,20 +62,24 @@ def with_the_grain(peaks: Peaks, second: Peaks, drawn: Grain) -> tuple[Peaks, Pe
         Peaks(*(np.where(turned, a, b) for a, b in zip(*waves, strict=True)))
         for waves in ((second, peaks), (peaks, second))
     )
-    return first, then
+    alone = (drawn.clear >= LONE) & (drawn.off(first.direction) > ASKEW) & (first.strength < WEAK)
+    direction = np.where(alone, drawn.direction, first.direction)
+    return Peaks(direction, first.spacing, np.where(alone, drawn.clear * WEAK, first.strength)), then
 
 
-def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple[Peaks, bool]:
-    """Give plantings in a square, where two directions are about as good, one a block; tell whether there are any.
+def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple[Peaks, Flags]:
+    """Give plantings in a square, where two directions are about as good, one a block; tell which windows are theirs.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
-    Only windows whose canopies aren't drawn out along one wave count.
+    Only windows whose canopies aren't drawn out along one wave count, and so many of them, as wide as long: beside a
+    hedge there are fewer.
     """
+    side = max(1, int(np.sqrt(least)))
     either = drawn.clear < CLEAR
     both = either & (second.strength >= AS_GOOD * peaks.strength) & (peaks.strength > 0)
     closed = binary_closing(np.pad(both, 2), np.ones((3, 3)))
-    blocks, n = label(binary_opening(closed, np.ones((BROAD, BROAD)))[2:-2, 2:-2])
-    out, square = [values.copy() for values in peaks], False
+    blocks, n = label(binary_opening(closed, np.ones((side, side)))[2:-2, 2:-2])
+    out, square = [values.copy() for values in peaks], np.zeros(both.shape, dtype=bool)
     for k in range(1, n + 1):
         block = blocks == k
         if np.count_nonzero(block & both) < least:
@@ -89,7 +96,7 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
         even = [some & (np.abs(spacing - usual) < EVEN * usual) for some, usual in zip(near, apart, strict=True)]
         if min(strength[some].sum() for some in even) < REGULAR * strength.sum() / 2:
             continue  # the block's edge, or gaps, and no second planting
-        square = True
+        square |= block
         i, j = np.nonzero(block)
         long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in (one, two)]
         alike = max(apart) < EQUAL * min(apart)
@@ -103,8 +110,8 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
     return Peaks(*out), square
 
 
-def prescribed(waves: list[Peaks], way: float) -> Peaks:
-    """The stronger wave of each window within ``NEAR_WAY`` of a direction; where there is none, that of the nearest."""
+def prescribed(waves: Sequence[Peaks], way: float) -> Peaks:
+    """The first wave of each window within ``NEAR_WAY`` of a direction; where there is none, that of the nearest."""
     out = [values.copy() for values in waves[0]]
     known = np.zeros(out[0].shape, dtype=bool)
     for wave in waves:
@@ -116,6 +123,13 @@ def prescribed(waves: list[Peaks], way: float) -> Peaks:
         return Peaks(out[0], out[1], np.zeros_like(out[2]))
     _spread(out, known, ~known & (waves[0].strength > 0))
     return Peaks(*out)
+
+
+def shown(peaks: Peaks, drawn: Grain, square: Flags) -> Values:
+    """How clearly rows show in windows beside their wave, 0–1: by the canopies' grain, or as they stand in a square."""
+    turn = np.cos(2 * (np.nan_to_num(peaks.direction) - drawn.direction))
+    out: Values = np.where(square, 1.0, drawn.clear * np.maximum(turn, 0.0))
+    return out
 
 
 def _spread(waves: list[Values], known: Flags, wrong: Flags) -> None:

@@ -102,12 +102,13 @@ def canopy_cover(
     chm : Raster
         Canopy height.
     rows : GeoDataFrame, optional
-        LineString with ``spacing_m``: known rows. Between them, and within half a spacing, nothing is too wide.
+        LineString with ``spacing_m``: known rows. Between them, and within half a spacing, nothing is too wide or flat.
     resolution : float
         Cell size in metres.
     low, high : float
         Heights in metres between which points count as canopy, the lower at the most where rows stand apart. What is
-        taller (trees, houses) or wider than a row of vines (huts, hedges, bushes) is left out, or flat (cars, pallets).
+        taller (trees, houses) or wider than a row of vines (huts, hedges, bushes) is left out, or flat (cars, pallets),
+        or far taller than the vines thereabouts and compact (trees).
     smoothing : float, optional
         Standard deviation in metres of the Gaussian that smooths both counts; by default the cloud's mean distance
         between points, and half a cell at the least.
@@ -120,8 +121,8 @@ def canopy_cover(
         Heights from which points count as canopy.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    no_vines = _grown(flat_things(chm, high) | trees(chm, high), MARGIN, chm.grid.resolution)
-    top = height_about(replace(chm, values=np.where(no_vines, np.nan, chm.values)), high)
+    flat, lone = (_grown(things(chm, high), MARGIN, chm.grid.resolution) for things in (flat_things, trees))
+    top = height_about(replace(chm, values=np.where(flat | lone, np.nan, chm.values)), high)
     foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
@@ -131,7 +132,7 @@ def canopy_cover(
     blocks = [block_sum(layer, k).astype(np.float32) for layer in counts]
     squares = Grid(grid.west, grid.north, side, *blocks[0].shape)
     about = _about(rows, squares)
-    things = spread(no_vines, chm.grid, squares) & ~about
+    things = (spread(flat, chm.grid, squares) & ~about) | spread(lone, chm.grid, squares)
     touching = closed = _closed(blocks[0], np.where(things, 0, blocks[1] + blocks[3]), side, TOUCHING)
     if touching.any():
         touching = closed & ~_grown(_closed(blocks[0], blocks[2] + blocks[3], side, WIDEST), WIDEST, side)
@@ -171,9 +172,9 @@ def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Val
 def _apart(touching: Flags, closed: Flags, counts: Sequence[Values], blocks: Grid, metres: Grid) -> Flags:
     """Cells of 1 m in which rows are told by where they stand apart: those where they touch, and those about them.
 
-    So a row is cut at one level all along. What touches none of those that touch keeps its own level if it is narrow,
-    or lower than they are. Counts are of all points in blocks of cells, of canopy, and of those above where rows stand
-    apart.
+    So a row is cut at one level as far as it is as wide. What lies beside those that touch keeps its own level if it is
+    narrow, or lower than they are. Counts are of all points in blocks of cells, of canopy, and of those above where
+    rows stand apart.
     """
     if not touching.any():
         return np.zeros(metres.shape, dtype=bool)

@@ -28,12 +28,13 @@ LEAST, MOST = 0.25, 0.5
 """Square metres that are flat in one piece, and share of a thing that such pieces are."""
 LONG, FEW = 3.5, 0.5
 """Length of a thing in its own widths from which on it may be vines, and share of what stands that is flat, at most."""
-TALL, TALLER, TRUNK = 1.2, 1.5, 1.0
-"""Heights of things in that of the vines thereabouts from which on a place belongs to a tree and from which it tells
-one, and square metres of a tree that do."""
+TALL, TALLER, TALLEST, TRUNK = 1.2, 1.5, 0.7, 1.0
+"""Heights in that of the vines thereabouts from which on a place belongs to a tree and from which it tells one, which
+is that much at the least of the height above which there are no vines: old vines among young ones are no trees. Square
+metres of a tree that tell it."""
 ROUND, FULL = 2.0, 0.85
 """Length of a tree in its own widths, at most, and share of its outline that it fills, at least."""
-AROUND = np.ones((3, 3))
+BESIDE = np.ones((3, 3))
 """A cell and those beside it."""
 
 
@@ -66,8 +67,8 @@ def flat_things(chm: Raster, high: float) -> Flags:
     area[0] = 0.0
     if area.max() < LEAST:
         return out
-    smooth = binary_dilation((area >= LEAST)[places], AROUND)[standing]
-    of = label(standing, AROUND)[0][standing] - 1
+    smooth = binary_dilation((area >= LEAST)[places], BESIDE)[standing]
+    of = label(standing, BESIDE)[0][standing] - 1
     size = np.bincount(of)
     flat = np.bincount(of, smooth) >= MOST * size
     flat &= _shape(of, size, *np.nonzero(standing))[0] < LONG
@@ -84,12 +85,13 @@ def trees(chm: Raster, high: float) -> Flags:
     heights = np.nan_to_num(chm.values)
     usual = spread(usual_height(chm, high), coarser(chm.grid, resolution=1.0), chm.grid)
     above: Flags = (heights >= TALL * usual) & (usual >= LOWEST)
-    places, n = label(above, AROUND)
+    places, n = label(above, BESIDE)
     if n == 0:
         return above
     of = places[above] - 1
     size = np.bincount(of)
-    trunk = np.bincount(of, (heights >= TALLER * usual)[above]) * chm.grid.resolution**2
+    tells = heights >= np.maximum(TALLER * usual, TALLEST * high)
+    trunk = np.bincount(of, tells[above]) * chm.grid.resolution**2
     length, full = _shape(of, size, *np.nonzero(above))
     above[above] = ((trunk >= TRUNK) & (length < ROUND) & (full >= FULL))[of]
     return above

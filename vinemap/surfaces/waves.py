@@ -305,6 +305,8 @@ class RowField:
     likelihood: Raster
     square: bool = False
     """Whether somewhere two directions were about as good, as where vines are planted in a square."""
+    plain: Raster | None = None
+    """How clearly rows show, 0–1, where their wave tells little: a lone row has none, a square two."""
 
     def at(self, xy: Values) -> tuple[Values, Values, Values]:
         """Direction, spacing and likelihood (n,) of the cells that hold points (n, ≥2)."""

@@ -47,8 +47,8 @@ LAST = 0.75
 """Metres beside a track within which a row's last post stands, and ``CLEAR`` inside."""
 POSTED = 0.2
 """Share of the gaps side by side with posts in them from which it is no track."""
-HOUSE = 2.0
-"""Spacings along a row over which what is taller than vines is no tree."""
+HOUSE = 7.0
+"""Metres along a row over which what is taller than vines is no crown of a tree."""
 STRIDE = 0.5
 """Metres between the places at which ground is looked at."""
 
@@ -102,14 +102,14 @@ def blocked(gaps: Gaps, chm: Raster, *, high: float) -> Flags:
     """Whether something stands in gaps (k,) that is taller than vines and longer than ``HOUSE``: a tree is shorter."""
     step = chm.grid.resolution
     out = np.zeros(len(gaps.length), dtype=bool)
-    for k in np.flatnonzero(gaps.length > HOUSE * gaps.spacing):
+    for k in np.flatnonzero(gaps.length > HOUSE):
         at = np.arange(-gaps.length[k] / 2, gaps.length[k] / 2, step)
         heights = sample(chm, gaps.middle[k] + at[:, None] * gaps.along[k])
         if not (known := np.isfinite(heights)).any():
             continue
         tall = np.interp(at, at[known], heights[known]) > high
         runs = find_objects(label(tall)[0])
-        out[k] = max((run.stop - run.start for (run,) in runs), default=0) * step > HOUSE * gaps.spacing[k]
+        out[k] = max((run.stop - run.start for (run,) in runs), default=0) * step > HOUSE
     return out
 
 

@@ -23,6 +23,8 @@ OWN = 0.3
 """Share of a canopy across that must lie outside of another row's for it to tell where it ends."""
 ACROSS = 0.5
 """Cover at the sides of what stands beyond an end, in that of its middle, from which it runs across the row."""
+HEDGE = 3.0
+"""Metres along a row that what runs across it takes at the most."""
 USUAL = 1.0
 """Metres between vines that are taken where nothing tells."""
 NOTHING = np.empty(0)
@@ -146,7 +148,7 @@ def _along(row: Standing) -> Values:
     """
     if np.median(row.sides) > ACROSS / 2:
         return row.runs
-    own = np.flatnonzero(row.sides <= ACROSS)
+    own = np.flatnonzero((row.sides <= ACROSS) | (np.diff(row.runs, axis=1)[:, 0] > HEDGE))
     return row.runs[own[0] : own[-1] + 1]
 
 
