@@ -130,3 +130,18 @@ def test_rows_beside_a_hedge_keep_their_level(cloud, tall, half_width):
     assert levels.touching.any()  # the hedge seems to be rows that touch
     usual, beside = (np.median(sample(cover, rows[k][20:-20])) for k in (1, 4))
     assert beside > 0.9 * usual
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_tree_in_a_row_is_left_out_whether_rows_are_known_or_not(cloud, known):
+    rows = rows_of(5, length=25)
+    x, y = rows[2][len(rows[2]) // 2]
+    tree = Obstacle(x, y, 1.4, 1.4, 3.5, 1.0)
+    survey = simulate([Vineyard("A", rows, dead=0)], hillside(0.05), obstacles=[tree], density=300, seed=6)
+    points = PointCloud(survey.xyz, cloud.crs)
+    points = points.above(terrain_model(points))
+    lines = survey.rows.assign(spacing_m=2.5) if known else None
+    cover, _ = canopy_cover(points, canopy_height_model(points), lines)
+    gx, gy = np.meshgrid(*cover.grid.centres())
+    assert cover.values[np.hypot(gx - x, gy - y) < 1.0].max() == 0
+    assert np.median(sample(cover, rows[2][:30])) > 0.3
