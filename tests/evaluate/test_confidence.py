@@ -113,7 +113,7 @@ def test_rows_that_bend_are_as_sure(spacing, radius):
     turn = np.linspace(-1, 1, 121)
     radii = radius + spacing * np.arange(3)
     bent = [np.column_stack([30 + r * np.sin(turn), 16 - r * np.cos(turn)]) for r in radii]
-    assert judged(bent)["confidence"].min() > 0.85
+    assert judged(bent)["confidence"].min() > 0.9
 
 
 def test_a_row_that_stops_where_others_run_through_is_a_piece_of_one():

@@ -60,7 +60,7 @@ def judge_rows(
     if len(rows) == 0:
         return rows.assign(confidence=np.empty(0), cut=np.empty(0))
     found = evidence(rows, cover, chm, field, seen, high=high)
-    odds = DOUBT + sum((weight * found[name].to_numpy() for name, weight in EVIDENCE.items()), np.zeros(len(rows)))
+    odds = DOUBT + sum(weight * found[name].to_numpy() for name, weight in EVIDENCE.items())
     return rows.assign(confidence=1 / (1 + np.exp(-odds)), cut=found["cut"].to_numpy())
 
 

@@ -47,7 +47,6 @@ LONE = 1 / 3
 """Company of a row that has none where the others have none, either."""
 RIDGE, FLANK = 0.35, 0.2
 """Shares of a row's usual cover from which a station has canopy, and down to which that reaches across."""
-
 FAINT, PLAIN = 0.15, 0.35
 """Likelihood of a row field that tells no rows, and from which on it tells them."""
 BLURRED, CLEAR = 0.3, 0.6

@@ -139,3 +139,9 @@ def smoothed(curve: Values, *, wavelength: float, beyond: float, step: float) ->
     origin = curve[0]
     out: Values = origin + solveh_banded(bands, weight[:, None] * (known - origin), lower=True)
     return out
+
+
+def turn_between(direction: Values, way: float | Values) -> Values:
+    """Radians between directions and a way, either sense: π / 2 at the most; NaN stays."""
+    out: Values = np.abs(np.angle(np.exp(2j * (direction - way)))) / 2
+    return out

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 
 from vinemap.compute.links import parts_of
+from vinemap.geo.curve import turn_between
 
 SAME_DIRECTION = np.radians(20)
 """Radians by which neighbouring rows of one block may differ."""
@@ -48,7 +49,7 @@ def group_blocks(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     ends = np.array([shapely.get_coordinates(line)[[0, -1]] for line in lines])
     angle = np.arctan2(*(ends[:, 1] - ends[:, 0]).T[::-1])
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=NEIGHBOURS * spacing)
-    alike = np.abs(np.angle(np.exp(2j * (angle[i] - angle[j])))) / 2 < SAME_DIRECTION
+    alike = turn_between(angle[i], angle[j]) < SAME_DIRECTION
     alike &= np.abs(np.log(spacing[i] / spacing[j])) < np.log(SAME_SPACING)
     labels = parts_of(n, i[alike], j[alike])
     west = np.bincount(labels, weights=ends[:, :, 0].mean(axis=1)) / np.bincount(labels)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation, binary_opening, distance_transform_edt, label
 
 from vinemap.compute.links import parts_of
+from vinemap.geo.curve import turn_between
 from vinemap.surfaces.waves import ASKEW, CLEAR, Peaks
 
 if TYPE_CHECKING:
@@ -87,11 +88,11 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
         waves = [np.concatenate([one[block], other[block]]) for one, other in zip(peaks, second, strict=True)]
         direction, spacing, strength = (values[waves[2] > 0] for values in waves)
         one = _most_common(direction, strength)
-        turned = _axial(direction, one) > np.pi / 6
+        turned = turn_between(direction, one) > np.pi / 6
         if not turned.any():
             continue
         two = _most_common(direction[turned], strength[turned])
-        near = [_axial(direction, way) < NEAR_WAY for way in (one, two)]
+        near = [turn_between(direction, way) < NEAR_WAY for way in (one, two)]
         apart = [float(np.median(spacing[some])) for some in near]
         even = [some & (np.abs(spacing - usual) < EVEN * usual) for some, usual in zip(near, apart, strict=True)]
         if min(strength[some].sum() for some in even) < REGULAR * strength.sum() / 2:
@@ -102,8 +103,8 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
         alike = max(apart) < EQUAL * min(apart)
         chosen = (one, two)[int(np.argmax(long if alike else apart))]
         around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
-        mine = around & (_axial(peaks.direction, chosen) < NEAR_WAY)
-        other = around & ~mine & (second.strength > 0) & (_axial(second.direction, chosen) < NEAR_WAY)
+        mine = around & (turn_between(peaks.direction, chosen) < NEAR_WAY)
+        other = around & ~mine & (second.strength > 0) & (turn_between(second.direction, chosen) < NEAR_WAY)
         for values, second_values in zip(out, second, strict=True):
             values[other] = second_values[other]
         _spread(out, mine | other, around & ~mine & ~other)
@@ -115,7 +116,7 @@ def prescribed(waves: Sequence[Peaks], way: float) -> Peaks:
     out = [values.copy() for values in waves[0]]
     known = np.zeros(out[0].shape, dtype=bool)
     for wave in waves:
-        near = ~known & (wave.strength > 0) & (_axial(wave.direction, way) < NEAR_WAY)
+        near = ~known & (wave.strength > 0) & (turn_between(wave.direction, way) < NEAR_WAY)
         for values, mine in zip(out, wave, strict=True):
             values[near] = mine[near]
         known |= near
@@ -140,18 +141,12 @@ def _spread(waves: list[Values], known: Flags, wrong: Flags) -> None:
             values[wrong] = values[a, b][wrong]
 
 
-def _axial(direction: Values, way: float | Values) -> Values:
-    """Radians between directions and a way, either sense; NaN stays."""
-    out: Values = np.abs(np.angle(np.exp(2j * (direction - way)))) / 2
-    return out
-
-
 def _most_common(direction: Values, weight: Values) -> float:
     """Direction in radians about which most others lie."""
     ways = np.radians(np.arange(0, 180, 2))
-    near = np.exp(-0.5 * (_axial(direction[:, None], ways) / NEAR_WAY * 2) ** 2)
+    near = np.exp(-0.5 * (turn_between(direction[:, None], ways) / NEAR_WAY * 2) ** 2)
     best = float(ways[int((near * weight[:, None]).sum(axis=0).argmax())])
-    close = _axial(direction, best) < NEAR_WAY
+    close = turn_between(direction, best) < NEAR_WAY
     return float(np.angle((weight * np.exp(2j * direction))[close].sum()) / 2 % np.pi)
 
 
@@ -178,7 +173,7 @@ def settled(peaks: Peaks, *, least: float) -> Peaks:
     pairs = pairs[held.ravel()[pairs].all(axis=1)]
     one, other = pairs.T
     direction, spacing = peaks.direction.ravel(), peaks.spacing.ravel()
-    alike = (_axial(direction[one], direction[other]) < ALIKE) & (
+    alike = (turn_between(direction[one], direction[other]) < ALIKE) & (
         np.abs(np.log(spacing[one] / spacing[other])) < np.log(LIKE_SPACING)
     )
     block = parts_of(my * mx, one[alike], other[alike])

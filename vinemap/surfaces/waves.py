@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
+from vinemap.geo.curve import turn_between
 from vinemap.geo.raster import cell_of
 
 if TYPE_CHECKING:
@@ -56,8 +57,8 @@ class Grain(NamedTuple):
 
     def off(self, direction: Values) -> Values:
         """Radians by which directions are off it; 0 where it isn't clear."""
-        turn = np.abs(np.angle(np.exp(2j * (direction - self.direction)))) / 2
-        out: Values = np.where(self.clear >= CLEAR, np.nan_to_num(turn), 0.0)
+        turn = np.nan_to_num(turn_between(direction, self.direction))
+        out: Values = np.where(self.clear >= CLEAR, turn, 0.0)
         return out
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from vinemap.compute.links import parts_of
 from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import sample, sample_across
+from vinemap.rows.centre_line import runs_above
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -107,9 +108,8 @@ def blocked(gaps: Gaps, chm: Raster, *, high: float) -> Flags:
         heights = sample(chm, gaps.middle[k] + at[:, None] * gaps.along[k])
         if not (known := np.isfinite(heights)).any():
             continue
-        tall = np.interp(at, at[known], heights[known]) > high
-        runs = find_objects(label(tall)[0])
-        out[k] = max((run.stop - run.start for (run,) in runs), default=0) * step > HOUSE
+        tall = runs_above(np.interp(at, at[known], heights[known]), high)
+        out[k] = np.diff(tall, axis=1).max(initial=0) * step > HOUSE
     return out
 
 

@@ -12,7 +12,8 @@ from shapely.ops import substring
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import Survey, simulate
-from vinemap.simulate.terrain import hillside
+from vinemap.simulate.terrain import PLACE, hillside
+from vinemap.simulate.yard import place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,3 +77,8 @@ def beyond(block: Sequence[Array], other: Sequence[Array], *, azimuth: float, tr
     way = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))])
     shift = (np.concatenate(list(block)) @ way).max() + track - (np.concatenate(list(other)) @ way).min()
     return [row + shift * way for row in other]
+
+
+def polyline(azimuth: float, *corners: tuple[float, float]) -> Array:
+    """Row through corners, metres along an azimuth from the middle of the place and to its left, in steps of 0.25 m."""
+    return np.array(shapely.LineString([place(PLACE, azimuth, *at) for at in corners]).segmentize(0.25).coords)

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-import shapely.affinity
 from scipy.interpolate import PchipInterpolator
 
-from vinemap.simulate.families.blocks import beyond, block, survey_of
+from vinemap.simulate.families.blocks import beyond, block, polyline, survey_of
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.terrain import PLACE, hillside, terraced
 from vinemap.simulate.yard import place
@@ -59,7 +58,7 @@ def close(rng: np.random.Generator) -> Survey:
 
 def contour(rng: np.random.Generator) -> Survey:
     """Rows along the contour lines of a slope with spurs and hollows, with bends of 8 m radius and wider."""
-    azimuth, spacing, n = math.radians(rng.uniform(0, 360)), rng.uniform(2.0, 2.6), 8
+    azimuth, spacing, n = rng.uniform(0, 360), rng.uniform(2.0, 2.6), 8
     length, height = rng.uniform(40, 50), rng.uniform(2.0, 3.5)
     along = np.linspace(-0.55, 0.55, 225) * length
     # Offset rows bend tighter on the inside by half of the block's width.
@@ -67,9 +66,8 @@ def contour(rng: np.random.Generator) -> Survey:
     wave = 2 * np.pi * max(np.sqrt(height * tightest), length / 7.5)
     middle = shapely.LineString(np.column_stack([along, height * np.sin(2 * np.pi * along / wave + rng.uniform(0, 6))]))
     rows = [middle.offset_curve((k + 0.5 - n / 2) * spacing).segmentize(0.25) for k in range(n)]
-    turn = (math.cos(azimuth), -math.sin(azimuth), math.sin(azimuth), math.cos(azimuth))
-    placed = [shapely.affinity.affine_transform(row, (*turn, *PLACE)) for row in rows]
-    return survey_of(rng, [shapely.get_coordinates(row) for row in placed], slope=0.2)
+    lines = [shapely.get_coordinates(row) for row in rows]
+    return survey_of(rng, [np.column_stack(place(PLACE, azimuth, *line.T)) for line in lines], slope=0.2)
 
 
 def kinked(rng: np.random.Generator) -> Survey:
@@ -79,7 +77,6 @@ def kinked(rng: np.random.Generator) -> Survey:
     def row(across: float) -> Array:
         at = -across * math.tan(turn / 2)
         corners = [(-22.0, across), (at, across), (at + 22 * math.cos(turn), across + 22 * math.sin(turn))]
-        line = shapely.LineString([place(PLACE, azimuth, *corner) for corner in corners])
-        return np.array(line.segmentize(0.25).coords)
+        return polyline(azimuth, *corners)
 
     return survey_of(rng, [row((k - 3.5) * spacing) for k in range(8)], ragged=0.5)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from vinemap.simulate.families.blocks import survey_of
+from vinemap.simulate.families.blocks import polyline, survey_of
 from vinemap.simulate.families.growing import PLANTED_THIS_YEAR
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.rays import Obstacle
@@ -60,7 +60,7 @@ def estate(rng: np.random.Generator) -> Survey:
         return place(PLACE, azimuth, along, across)
 
     def row(across: float, start: float, end: float) -> Array:
-        return np.array(shapely.LineString([at(start, across), at(end, across)]).segmentize(0.25).coords)
+        return polyline(azimuth, (start, across), (end, across))
 
     spacing, close = rng.uniform(1.8, 2.3), rng.uniform(1.65, 1.8)
     steps = [spacing] * 4 + [(spacing + close) / 2] + [close] * 3 + [(spacing + close) / 2] + [spacing] * 3
@@ -102,18 +102,16 @@ def hedged(rng: np.random.Generator) -> Survey:
     def at(along: float, across: float) -> tuple[float, float]:
         return place(PLACE, azimuth, along, across)
 
-    def line(start: tuple[float, float], end: tuple[float, float]) -> Array:
-        return np.array(shapely.LineString([at(*start), at(*end)]).segmentize(0.25).coords)
-
     def row(k: int) -> list[Array]:
         across = k * spacing - side
         if k not in (2, 3):
-            return [line((-22, across), (22, across))]
-        return [line((-22, across), (-6, across)), line((6, across), (22, across))]
+            return [polyline(azimuth, (-22, across), (22, across))]
+        return [polyline(azimuth, (-22, across), (-6, across)), polyline(azimuth, (6, across), (22, across))]
 
     rows = [part for k in range(n) for part in row(k)]
     beside, beyond = side + rng.uniform(3.0, 3.6), 22 + rng.uniform(1.8, 3.0)
-    borders = [line((-22, -beside), (22, -beside)), line((beyond, -side), (beyond, side))]
+    along_them, across_them = ((-22, -beside), (22, -beside)), ((beyond, -side), (beyond, side))
+    borders = [polyline(azimuth, *ends) for ends in (along_them, across_them)]
     hedges = Vineyard("", borders, rng.uniform(1.5, 3.0), rng.uniform(0.5, 0.8), bottom=0.0)
     house = Obstacle(*at(0.0, 2.5 * spacing - side), 4.0, 0.9 * spacing, 5.0, solid=True, azimuth=azimuth)
     lanes = (rng.choice(np.arange(5, n), 3, replace=False)) * spacing - side
