@@ -21,6 +21,7 @@ def one_section(points, heights=None):
         np.zeros((1, 3)),
         np.array([[1.0, 0]]),
         2.5 * one,
+        0.4 * one,
         start,
         points,
         points[:, 1].copy() if heights is None else heights,
@@ -37,4 +38,5 @@ def many_sections(points, *, spacing=2.5, step=0.25, member=None):
     position = step * np.arange(m)
     origin = np.column_stack([position, np.zeros((m, 2))])
     member = np.arange(len(flat), dtype=np.int32) if member is None else np.concatenate(member)
-    return Sections(np.ones(m, int), position, origin, way, np.full(m, spacing), start, flat, flat[:, 1].copy(), member)
+    of_each = np.full(m, spacing), np.full(m, 0.4)
+    return Sections(np.ones(m, int), position, origin, way, *of_each, start, flat, flat[:, 1].copy(), member)

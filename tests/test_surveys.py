@@ -103,6 +103,21 @@ def test_canopies_against_the_true_profile(modelled, shared, name):
     assert judge_canopies(rows, model.table, step=0.25)["canopy_confidence"].min() > 0.5
 
 
+def test_canopies_of_airborne_lidar(modelled, shared):
+    """Ten points a square metre, eight of which stand for a metre of canopy."""
+    found, model = modelled("als10")
+    rows = summarise_rows(found.rows, model.table, step=0.25)
+    truth = gpd.read_file(shared / "surveys" / "als10" / "truth.gpkg", layer="rows")
+    pairs = evaluate_rows(rows[["geometry"]], truth[["geometry"]]).pairs[["row_id", "reference"]].astype(int)
+    mine, true = rows.iloc[pairs["row_id"] - 1], truth.iloc[pairs["reference"] - 1]
+    assert len(pairs) == len(truth)
+    assert np.abs(mine["height_m"].to_numpy() - true["mean_height"].to_numpy()).max() < 0.06
+    assert np.abs(mine["width_m"].to_numpy() - true["mean_width"].to_numpy()).max() < 0.08
+    with np.load(shared / "surveys" / "als10" / "profiles.npz") as profiles:
+        area, living = true_outlines(profiles, model.at)
+    assert mine["volume_m3"].sum() == pytest.approx(shapely.area(area)[living].sum() * 0.25, rel=0.1)
+
+
 def test_canopies_whose_volumes_do_not_follow_truth_are_doubtful(modelled):
     found, model = modelled("stereo_straight_poor")
     rows = judge_canopies(summarise_rows(found.rows, model.table, step=0.25), model.table, step=0.25)

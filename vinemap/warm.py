@@ -142,10 +142,12 @@ def model_canopies_of_none() -> None:
 
     m, each = 20, 50
     member, leaves = np.arange(m * each, dtype=np.int32), _leaves(m * each).astype(np.float32)
-    position, spacing, along = np.linspace(0, LENGTH, m), np.full(m, SPACING), np.tile([1.0, 0.0], (m, 1))
+    position, along = np.linspace(0, LENGTH, m), np.tile([1.0, 0.0], (m, 1))
+    spacing, extent = np.full(m, SPACING), np.ones(m)
     start, places = np.arange(m + 1) * each, np.column_stack([position, np.zeros((m, 2))])
     heights = leaves[:, 1].copy()
-    sections = Sections(np.zeros(m, dtype=np.int64), position, places, along, spacing, start, leaves, heights, member)
+    row_id = np.zeros(m, dtype=np.int64)
+    sections = Sections(row_id, position, places, along, spacing, extent, start, leaves, heights, member)
     model = model_sections([separate_canopy(sections)], parse_crs("EPSG:32632"))
     n = len(model.polygons)
     distances(np.zeros((n, 3)), np.arange(n), model.at, model.polygons, step=LENGTH)

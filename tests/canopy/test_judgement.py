@@ -29,9 +29,9 @@ def rows_of(heights, widths=0.5, block=1, apart=2.5):
     return gpd.GeoDataFrame(table | {"height_m": heights, "width_m": widths}, geometry=lines, crs=32632)
 
 
-def sections_of(n=N, seen=0.9, width=0.5, row_id=1):
+def sections_of(n=N, seen=0.9, width=0.5, row_id=1, extent=0.4):
     sizes = {"width_m": np.broadcast_to(width, n), "area_m2": 1.2 * np.broadcast_to(width, n)}
-    return pd.DataFrame({"row_id": row_id, "position_m": STEP * np.arange(n), "seen": seen} | sizes)
+    return pd.DataFrame({"row_id": row_id, "position_m": STEP * np.arange(n), "seen": seen, "extent_m": extent} | sizes)
 
 
 def confidence(sections, **columns):
@@ -58,6 +58,15 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
     ]
     assert low == pytest.approx([0.05, 0.56, 1.0], abs=0.01)
     assert confidence(sections_of(), height_m=1.2, bottom_m=0.5) == pytest.approx(1)  # trunks show beneath it
+
+
+def test_sections_that_share_points_do_not_speak_for_each_other():
+    """Wide sections a metre apart have most points in common: only those that have none are two witnesses."""
+    waving = 0.5 + 0.2 * np.sin(np.pi * STEP * np.arange(N) / 5.0)
+    assert confidence(sections_of(width=waving)) > 0.6
+    assert confidence(sections_of(width=waving, extent=5.0)) < 0.2
+    assert confidence(sections_of(extent=5.0)) == pytest.approx(1)
+    assert confidence(sections_of(extent=LENGTH + 1)) == 0
 
 
 def test_without_a_canopy_there_is_neither_confidence_nor_flag():

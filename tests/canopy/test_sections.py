@@ -14,7 +14,7 @@ from tests.sections import many_sections, separate
 from vinemap.canopy.feet import find_feet
 from vinemap.canopy.foliage import living_canopies, separate_canopy
 from vinemap.canopy.growth import foliage_reach
-from vinemap.canopy.model import model_sections
+from vinemap.canopy.model import find_canopies, model_sections
 from vinemap.canopy.numbers import (
     complexity_reduction,
     measure_sections,
@@ -27,6 +27,7 @@ from vinemap.canopy.peeling import peel_sections
 from vinemap.canopy.points import NO_SECTIONS, join
 from vinemap.canopy.sections import cut_sections
 from vinemap.cloud.points import PointCloud
+from vinemap.config.settings import Settings
 from vinemap.geo.raster import Grid, Raster
 from vinemap.surfaces.ground import terrain_model
 
@@ -92,15 +93,30 @@ def test_points_go_to_the_nearest_row():
     assert (y[row == 2] >= 0.87).all()
 
 
-@pytest.mark.parametrize(("per_metre", "width"), [(200, 0.4), (75, 0.6), (5, 1.0)])
+@pytest.mark.parametrize(("per_metre", "width"), [(200, 0.4), (75, 0.6), (15, 3.0)])
 def test_sections_are_wider_where_points_are_few(per_metre, width):
     n = 20 * per_metre
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform(0, 20, n), rng.uniform(-0.5, 0.5, n), rng.uniform(1, 2, n)])
     rows = rows_frame([np.array([[0, 0], [20.0, 0]])])
     sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
-    inner = (sections.position > 1) & (sections.position < 19)
+    inner = (sections.position > 2) & (sections.position < 18)
     assert np.diff(sections.start)[inner].mean() == pytest.approx(per_metre * width, rel=0.15)
+    assert sections.extent == pytest.approx(width, rel=0.1)
+
+
+def test_wide_sections_follow_the_soil_along_the_row():
+    """Of a flat canopy at 1.5 m over a slope along the row a section is as thin as at a station."""
+    rng, slope = np.random.default_rng(0), 0.5
+    x, n = rng.uniform(0, 20, 200), 200
+    soil = 30 * slope + slope * x
+    xyz = np.column_stack([x, rng.uniform(-0.4, 0.4, n), soil + 1.5])
+    grid = Grid(-5, 35, 1.0, 40, 40)
+    dtm = Raster(np.tile(slope * (25.5 + np.arange(40)), (40, 1)), grid, UTM)
+    cloud, rows = PointCloud(xyz, UTM, heights=xyz[:, 2] - soil), rows_frame([np.array([[0, 0], [20.0, 0]])])
+    sections = join(cut_sections(cloud, rows, gaps_frame(), dtm, lambda s: s))
+    assert sections.extent.min() > 3
+    assert sections.points[:, 1] == pytest.approx(1.5, abs=0.01)
 
 
 def test_no_rows_no_sections():
@@ -145,6 +161,22 @@ def test_canopy_is_told_from_terrain_and_measured(vineyard, cloud):
     assert np.abs(rows["height_m"] - truth["mean_height"]).max() < 0.08
     assert np.abs(rows["width_m"] - truth["mean_width"]).max() < 0.12
     assert rows["volume_m3"].sum() == pytest.approx(0.5 * 0.25 * m, rel=0.03)
+
+
+def test_canopies_of_lidar_are_as_large_as_those_of_a_dense_cloud(vineyard, cloud):
+    """Of 12 points a square metre few are a canopy's; by the metre of row they would be lost as noise."""
+    truth = vineyard.rows.assign(row_id=vineyard.rows["row"], spacing_m=2.5)
+    chosen = np.random.default_rng(0).random(len(cloud.xyz)) < 12 / 350
+    told = []
+    for points in (cloud, PointCloud(cloud.xyz[chosen], UTM)):
+        dtm = terrain_model(points)
+        found = find_canopies(points.above(dtm), truth, gaps_frame(), dtm, Settings())
+        told.append(summarise_rows(truth, model_sections(found, UTM).table, step=0.25))
+    dense, sparse = told
+    assert sparse["volume_m3"].sum() == pytest.approx(dense["volume_m3"].sum(), rel=0.1)
+    assert np.abs(sparse["volume_m3"] / dense["volume_m3"] - 1).max() < 0.25
+    assert np.abs(sparse["height_m"] - truth["mean_height"]).max() < 0.08
+    assert np.abs(sparse["width_m"] - truth["mean_width"]).max() < 0.15
 
 
 def test_quantile_of_each_section():

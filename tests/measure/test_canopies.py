@@ -35,7 +35,8 @@ def model(survey, grown=0.0):
     position = np.concatenate([np.cumsum(foliage.step[foliage.row == k]) for k in range(3)])
     origin = np.column_stack([foliage.xy, np.zeros(m)])
     start = np.arange(0, 4 * m + 1, 4)
-    canopy = Sections(foliage.row + 1, position, origin, way, np.full(m, 2.5), start, points, tops, np.arange(4 * m))
+    of_each = np.full(m, 2.5), foliage.step
+    canopy = Sections(foliage.row + 1, position, origin, way, *of_each, start, points, tops, np.arange(4 * m))
     measures = measure_sections(canopy, foliage.bottom, (area, area, area), c=drawn.shape[1])
     table = tabulate_sections(canopy, drawn, measures, crs=survey.rows.crs)
     return CanopyModel(canopy, drawn, table, np.zeros(m), np.ones(m, dtype=bool), canopy)

@@ -22,7 +22,7 @@ CONTRACT = {
     "row_ends": "row_id label end beyond".split(),
     "key_points": "row_id label order position_m".split(),
     "sections": (
-        "row_id label position_m height_m bottom_m width_m area_m2 n_points "
+        "row_id label position_m height_m bottom_m width_m area_m2 n_points extent_m "
         "trv_m3_ha lwa_m2_ha good under over reduction quality"
     ).split(),
     "gaps": "row_id label start_m end_m length_m n_missing state".split(),

@@ -103,7 +103,8 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
     -------
     GeoDataFrame
         LineStringZ with ``row_id``, ``position_m``, ``height_m`` (98.5% height above ground), ``bottom_m``,
-        ``width_m`` (2–98% across), ``area_m2`` (the foliage's), ``n_points``; tree-row volume ``trv_m3_ha`` = height ·
+        ``width_m`` (2–98% across), ``area_m2`` (the foliage's), ``n_points`` and the ``extent_m`` along the row from
+        which they are; tree-row volume ``trv_m3_ha`` = height ·
         width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha`` = 2 (height − bottom) · 10,000 / spacing; Table 3.1's
         indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``,
         the share of both sides on which there are points.
@@ -122,6 +123,7 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
             "width_m": width,
             "area_m2": area,
             "n_points": n_points,
+            "extent_m": at.extent,
             "trv_m3_ha": height * width * HECTARE / at.spacing,
             "lwa_m2_ha": 2 * (height - bottom) * HECTARE / at.spacing,
             "good": good,
@@ -242,9 +244,9 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     The confidence, from 0 to 1, is the product of six shares: of the row's length without its gaps that has sections;
     of the canopy that isn't cut at a side; of the canopy that was seen, on both sides from its lowest points to its
     top; of the underside that isn't hidden, as it is where a canopy is wider than deep; of what stands above
-    weeds, where it is low; and of the agreement of sections a metre apart in width and area, in which canopies of one
-    row don't differ much. Flagged are heights and widths whose ratio to the median of their block, or of the rows
-    around one that is of no block, is odd, if rows there don't differ anyway.
+    weeds, where it is low; and of the agreement in width and area of sections a metre apart, or as far as they share
+    no point, in which canopies of one row don't differ much. Flagged are heights and widths whose ratio to the median
+    of their block, or of the rows around one that is of no block, is odd, if rows there don't differ anyway.
 
     Parameters
     ----------
@@ -288,12 +290,17 @@ def _between(values: Values, ends: tuple[float, float]) -> Values:
 
 
 def _difference(sections: gpd.GeoDataFrame, *, step: float) -> pd.Series:
-    """Median difference of rows' sections a metre apart, of their median, in width or area, whichever is more."""
-    apart = max(1, round(1 / step))
-    row, position = sections["row_id"].to_numpy(), sections["position_m"].to_numpy()
-    pairs = (row[apart:] == row[:-apart]) & (position[apart:] - position[:-apart] < (apart + 1) * step)
+    """Median difference of rows' sections a metre or their extent apart, in width or area, whichever is more.
+
+    It is told as a share of the median section's.
+    """
+    row, position, extent = (sections[name].to_numpy() for name in ("row_id", "position_m", "extent_m"))
+    apart = np.maximum(1, np.round(np.maximum(extent, 1) / step).astype(int))
+    one = np.flatnonzero(np.arange(len(row)) + apart < len(row))
+    other = one + apart[one]
+    pairs = (row[other] == row[one]) & (position[other] - position[one] < (apart[one] + 1) * step)
     sizes = sections[["width_m", "area_m2"]].to_numpy(dtype=float)
-    differences = pd.DataFrame(np.abs(sizes[apart:] - sizes[:-apart])[pairs]).groupby(row[apart:][pairs]).median()
+    differences = pd.DataFrame(np.abs(sizes[other] - sizes[one])[pairs]).groupby(row[one][pairs]).median()
     medians = pd.DataFrame(sizes).groupby(row).median()
     # A few sections can't be held against each other, which doesn't speak for them.
     out: pd.Series = (differences / medians).fillna(1.0).max(axis=1)

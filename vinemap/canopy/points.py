@@ -96,10 +96,12 @@ class Sections(NamedTuple):
     """Horizontal unit vectors (m, 2) along γ: the x axes of {LOC_k}."""
     spacing: Values
     """Local inter-row spacing δ (m,) in metres."""
+    extent: Values
+    """Metres (m,) along γ from which each has its points."""
     start: Ints
     """First point (m + 1,) of each section."""
     points: NDArray[np.float32]
-    """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil."""
+    """Points (n, 2) as y and z of {LOC_k}: metres to the left of γ, metres above its soil beside them."""
     height: Values
     """Height above the terrain model (n,) in metres."""
     member: NDArray[np.int32]
@@ -122,6 +124,7 @@ class Sections(NamedTuple):
             self.origin[sections],
             self.tangent[sections],
             self.spacing[sections],
+            self.extent[sections],
             np.concatenate([[0], np.cumsum(n[sections])]),
             kept,
             height,
@@ -130,7 +133,7 @@ class Sections(NamedTuple):
 
     def without_points(self) -> Sections:
         """The sections as places."""
-        return Sections(*self[:5], np.zeros_like(self.start), self.points[:0], self.height[:0], self.member[:0])
+        return Sections(*self[:6], np.zeros_like(self.start), self.points[:0], self.height[:0], self.member[:0])
 
 
 NO_SECTIONS = Sections(
@@ -138,6 +141,7 @@ NO_SECTIONS = Sections(
     np.empty(0),
     np.empty((0, 3)),
     np.empty((0, 2)),
+    np.empty(0),
     np.empty(0),
     np.zeros(1, dtype=np.int64),
     np.empty((0, 2), dtype=np.float32),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vinemap.cloud.frame import Taken
     from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Ints, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
 
 T = TypeVar("T")
@@ -46,7 +46,7 @@ def cut_sections(
     width: float = 0.4,
     step: float = 0.25,
     min_points: int = 45,
-    max_width: float = 1.0,
+    max_width: float = 10.0,
     low: float = 0.5,
     high: float = 3.6,
 ) -> list[T]:
@@ -80,7 +80,10 @@ def cut_sections(
 
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
-        position = _stations(lines[row], gaps[gaps["row_id"] == numbers[row]], step)
+        stations = np.linspace(0, lines[row].length, max(2, round(lines[row].length / step) + 1))
+        soil_line = sample(dtm, at(curves[row], stations))
+        canopied = _outside(gaps[gaps["row_id"] == numbers[row]], stations)
+        position, level = stations[canopied], soil_line[canopied]
         top, half = canopy_size(left, height, float(spacing[row]), high)
         below = min(SOIL, canopy_floor(left, height, (top, half), float(spacing[row])))
         canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
@@ -89,16 +92,16 @@ def cut_sections(
         every = max(1, int(soil * a / length / SOIL_POINTS))
         n, index = _members(along, height, position, a / 2, (below, every))
         start = np.concatenate([[0], np.cumsum(n)])
-        here = at(curves[row], position)
-        level = sample(dtm, here)
-        points, heights, members = _take_each(index, left, elevation, height, member, start, level)
+        every_step = (soil_line, stations[1])
+        points, heights, members = _take_each(index, along, left, elevation, height, member, every_step)
         return then(
             Sections(
                 np.full(len(position), numbers[row]),
                 position,
-                np.column_stack([here, level]),
+                np.column_stack([at(curves[row], position), level]),
                 tangents(curves[row], position),
                 np.full(len(position), spacing[row]),
+                np.full(len(position), a),
                 start,
                 points,
                 heights,
@@ -208,27 +211,33 @@ def _list_members(
 @compiled
 def _take_each(
     index: NDArray[np.int32],
+    along: Values,
     left: Values,
     elevation: Values,
     height: Values,
     member: NDArray[np.int32],
-    start: Ints,
-    level: Values,
+    soil: tuple[Values, float],
 ) -> tuple[NDArray[np.float32], Values, NDArray[np.int32]]:
-    """Points (n, 2) of sections whose soil lies at ``level`` (m,), their heights, and which of the cloud's they are."""
+    """Points (n, 2) of sections, metres above the row's soil beside them, their heights, and which of the cloud's.
+
+    ``soil`` is the soil's elevation (k,) along the row, and the metres between these.
+    """
     n = len(index)
     points, heights, members = np.empty((n, 2), np.float32), np.empty(n, height.dtype), np.empty(n, member.dtype)
-    for k in range(len(level)):
-        for i in range(start[k], start[k + 1]):
-            p = index[i]
-            points[i, 0], points[i, 1] = left[p], elevation[p] - level[k]
-            heights[i], members[i] = height[p], member[p]
+    levels, step = soil
+    for i in range(n):
+        p = index[i]
+        at_step = min(max(along[p] / step, 0.0), len(levels) - 1.0)
+        k = min(int(at_step), len(levels) - 2)
+        points[i, 0] = left[p]
+        points[i, 1] = elevation[p] - levels[k] - (at_step - k) * (levels[k + 1] - levels[k])
+        heights[i], members[i] = height[p], member[p]
     return points, heights, members
 
 
-def _stations(line: shapely.LineString, gaps: gpd.GeoDataFrame, step: float) -> Values:
-    """Positions along a row at equal steps from end to end, but for those in gaps."""
-    position = np.linspace(0, line.length, max(2, round(line.length / step) + 1))
+def _outside(gaps: gpd.GeoDataFrame, position: Values) -> Flags:
+    """Whether positions (m,) along a row lie in none of its gaps."""
+    out = np.ones(len(position), dtype=bool)
     for start, end in zip(gaps["start_m"], gaps["end_m"], strict=True):
-        position = position[(position <= start) | (position >= end)]
-    return position
+        out &= (position <= start) | (position >= end)
+    return out

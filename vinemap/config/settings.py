@@ -184,7 +184,7 @@ class SectionOptions(Options):
     width: float = Field(0.4, ge=0.05, le=2, description="extent a along the row (m)")
     step: float = Field(0.25, ge=0.05, le=5, description="distance b along the row (m)")
     min_points: int = Field(45, ge=0, le=1000, description="canopy points for which sections are widened")
-    max_width: float = Field(1.0, ge=0.05, le=5, description="extent to which they may be (m)")
+    max_width: float = Field(10.0, ge=0.05, le=50, description="extent to which they may be (m)")
 
 
 class CanopyOptions(Options):

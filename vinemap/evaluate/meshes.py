@@ -30,6 +30,8 @@ PATCH, PATCHES = 0.2, 12
 many of them an outline has at the least, so that those of a small canopy are narrower."""
 FEW = 30
 """Patches whose median tells an error to a centimetre; of fewer it isn't told."""
+CROWD = 1.2
+"""Points of a patch, on the mean, of which the outermost is the surface's; a lone one is any of the foliage's depth."""
 UPPER = 2 / 3
 """Share of a canopy's depth above which it is seen from both sides, and tells its middle."""
 SURE = 0.5
@@ -58,7 +60,8 @@ def measure_meshes(
     the mesh, on its sides and top. In each of the ``PATCHES`` the surface lies where the outermost point does, and
     as much further out as foliage reaches beyond its points. What one flank hides the other shows: of a patch tell its
     own points or, where these are more, those of the other side, mirrored. All are NaN without a canopy, and the
-    last where few patches have points, where ``tops`` alone were seen, and where ``canopy_confidence`` is low.
+    last where few patches have points, or most have one, where ``tops`` alone were seen, and where
+    ``canopy_confidence`` is low.
 
     Parameters
     ----------
@@ -122,8 +125,10 @@ def _error(section: Ints, sides: Sequence[Near], reach: Values) -> float:
         n[side] = np.bincount(place, minlength=n.shape[1])
         np.maximum.at(outermost[side], place, near.distance[seen] + reach[section[seen]])
     own, mirrored = outermost
-    off = np.where(n[0] >= n[1], own, mirrored)[n.any(axis=0)]
-    return float(np.median(np.abs(off))) if len(off) >= FEW else np.nan
+    told = n.any(axis=0)
+    off = np.where(n[0] >= n[1], own, mirrored)[told]
+    known = len(off) >= FEW and n.max(axis=0)[told].mean() >= CROWD
+    return float(np.median(np.abs(off))) if known else np.nan
 
 
 def _places(cloud: Cloud, member: NDArray[np.int32]) -> Floats:

@@ -55,7 +55,7 @@ LAYERS: dict[str, Layer] = {
         _ROW
         | dict.fromkeys(("position_m", "height_m", "bottom_m", "width_m", "area_m2"), REAL)
         | {"n_points": WHOLE}
-        | dict.fromkeys(("trv_m3_ha", "lwa_m2_ha", "good", "under", "over", "reduction", "quality"), REAL),
+        | dict.fromkeys(("extent_m", "trv_m3_ha", "lwa_m2_ha", "good", "under", "over", "reduction", "quality"), REAL),
         "Sections across the canopy",
     ),
     "gaps": Layer(

@@ -39,6 +39,7 @@ WORDS = {
     "n_rows": "Rows",
     "n_key_points": "Key points",
     "n_points": "Points",
+    "extent_m": "Length of row that the points are from (m)",
     "n_missing": "Missing vines",
     "support": "Share of the length with canopy",
     "confidence": "Confidence that it is a row",
