@@ -67,3 +67,13 @@ def test_posts_that_stick_out_of_low_vines_are_cut_off():
     tall = young[0] * [1, 2.6]
     (canopy,) = separate(many_sections([tall] * 20 + [np.concatenate([tall, post])]))
     assert canopy.sections.points[:, 1].max() == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("across", "top"), [(0.03, 0.7), (0.3, 1.35)])
+def test_posts_make_no_row_taller(across, top):
+    """Where 8% of a young row's points are theirs; so many of old vines are the row's."""
+    rng = np.random.default_rng(0)
+    young = np.column_stack([rng.uniform(-0.15, 0.15, 1150), rng.uniform(0.2, 0.7, 1150)])
+    tall = np.column_stack([rng.uniform(-across, across, 100), rng.uniform(0.9, 2.0, 100)])
+    left, up = np.concatenate([young, tall]).T
+    assert canopy_size(left, up, 2.0, 3.6)[0] == pytest.approx(top, abs=0.06)

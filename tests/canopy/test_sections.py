@@ -93,12 +93,14 @@ def test_points_go_to_the_nearest_row():
     assert (y[row == 2] >= 0.87).all()
 
 
-@pytest.mark.parametrize(("per_metre", "width"), [(200, 0.4), (75, 0.6), (15, 3.0)])
-def test_sections_are_wider_where_points_are_few(per_metre, width):
+@pytest.mark.parametrize(
+    ("per_metre", "half", "width"), [(200, 0.35, 0.4), (75, 0.35, 0.6), (15, 0.35, 3.0), (75, 1.0, 1.6)]
+)
+def test_sections_are_wider_where_points_are_few_for_the_canopy(per_metre, half, width):
     n = 20 * per_metre
     rng = np.random.default_rng(0)
-    xyz = np.column_stack([rng.uniform(0, 20, n), rng.uniform(-0.5, 0.5, n), rng.uniform(1, 2, n)])
-    rows = rows_frame([np.array([[0, 0], [20.0, 0]])])
+    xyz = np.column_stack([rng.uniform(0, 20, n), rng.uniform(-half, half, n), rng.uniform(1, 2, n)])
+    rows = rows_frame([np.array([[0, 0], [20.0, 0]])], spacing=4.0)
     sections = cut(xyz, rows, gaps_frame(), flat(-5, -5))
     inner = (sections.position > 2) & (sections.position < 18)
     assert np.diff(sections.start)[inner].mean() == pytest.approx(per_metre * width, rel=0.15)

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.points import NO_SECTIONS, canopy_floor, canopy_size
+from vinemap.canopy.points import NO_SECTIONS, STICKING, USUAL_AREA, canopy_floor, canopy_size, is_post
 from vinemap.compute.compiled import compiled
-from vinemap.compute.order import quantile
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
@@ -23,14 +22,12 @@ LEVELS = round(3 / BIN)
 """Bins of elevations, from 1.5 m below a section's soil to as much above it."""
 NOISE_CELL = 0.1
 """Metres: cells of a section in which a point has neighbours or is noise."""
-USUAL_CELLS = 100
-"""Cells of a canopy of usual size; a larger one spreads its points over more."""
+USUAL_CELLS = round(USUAL_AREA / NOISE_CELL**2)
+"""Such cells of a canopy of usual size."""
 TALL = 0.1
 """Share of a section's canopy that must be high."""
 UPPER = 0.5
 """Share of a row's height from which points are high."""
-STICKING, THIN = 1.3, 0.1
-"""Height, in the row's own, from which points are a post's if half of them lie within so many metres across the row."""
 GROUND = 0.3
 """Metres above or below the terrain model within which points tell the inter-row's elevation."""
 
@@ -142,7 +139,7 @@ def _separate(
         y, z, up, kept = points[mine, 0], points[mine, 1], height[mine], keep[mine]
         for p in range(len(y)):
             kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
-        if _is_post(y, up, kept, STICKING * top):
+        if _sticks_out(y, up, kept, STICKING * top):
             for p in range(len(y)):
                 kept[p] = kept[p] and up[p] <= top
         for side in range(2):
@@ -162,20 +159,14 @@ def _separate(
 
 
 @compiled
-def _is_post(y: Values, up: Values, canopy: Flags, low: float) -> bool:
-    """Whether what stands above some height is thin; strays beside it don't make it wide."""
-    above = np.empty(len(y))
-    n = first = int(np.int64(0))  # a plain 0 would have `quantile` compiled twice
+def _sticks_out(y: Values, up: Values, canopy: Flags, low: float) -> bool:
+    """Whether what stands above some height is a post."""
+    above, n = np.empty(len(y)), int(np.int64(0))  # with a plain 0 `is_post` would be compiled twice
     for p in range(len(y)):
         if canopy[p] and up[p] > low:
             above[n] = y[p]
             n += 1
-    if n == 0:
-        return False
-    middle = quantile(above, first, n, 0.5)
-    for i in range(n):
-        above[i] = abs(above[i] - middle)
-    return quantile(above, first, n, 0.5) <= THIN
+    return is_post(above, n)
 
 
 @compiled

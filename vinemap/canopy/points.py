@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vinemap.compute.compiled import compiled
+from vinemap.compute.order import quantile
 from vinemap.compute.threads import in_threads, stretches
 
 if TYPE_CHECKING:
@@ -19,14 +20,19 @@ if TYPE_CHECKING:
 
 BIN = 0.05
 """Metres: bins of heights, and across, in which a row's canopy is measured."""
-LEAST, TOP = 0.2, 0.95
-"""Metres above which points may be a canopy's, and the order of their heights that is its height."""
+LEAST, TOP, BULK = 0.2, 0.95, 0.9
+"""Metres above which points may be a canopy's, and the orders of their heights that are its height, and the least that
+it may be where posts stick out."""
+STICKING, THIN = 1.3, 0.1
+"""Height, in the row's own, from which points are a post's if half of them lie within so many metres across the row."""
 LOWEST, FOOT = 0.15, 0.36
 """Metres, and share of a row's height over ``LEAST``, from which its canopy is told from weeds."""
 UPPER, EDGE = 0.5, 0.1
 """Share of its height above which a canopy's width is told, and share of its density, from its middle, at its sides."""
 WIDER, BESIDE = 1.5, 0.2
 """By how much, and by how many metres, a canopy may be wider than it is on the whole."""
+USUAL_AREA = 1.0
+"""Square metres across it that a canopy of usual size fills at the most; larger ones spread their points over more."""
 LOWLY = 1.3
 """Metres below which a row is low."""
 SOLID, RISE, CLEAR = 0.25, 1.5, 0.15
@@ -62,7 +68,7 @@ def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacin
     floor = float(above_weeds(top))
     if top >= LOWLY:
         return floor
-    inner = max((half - BESIDE) / WIDER, BIN)
+    inner = _edge(half)
     strips = np.array([0.0, inner, WIDER * inner, half, max(half, 0.5 * spacing)])
     density = _densities(left, height, strips, round(top / BIN))
     inside, beside = density[0], density[2:].max(axis=0)
@@ -78,6 +84,17 @@ def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacin
     while level > 0 and SOLID * usual <= inside[level] <= RISE * least and beside[level] <= CLEAR * inside[level]:
         floor, least, level = min(floor, level * BIN), min(least, inside[level]), level - 1
     return floor
+
+
+def canopy_area(size: tuple[float, float], floor: float) -> float:
+    """Square metres across it that a row's canopy fills, about, of a size and floor as above."""
+    top, half = size
+    return 2 * _edge(half) * max(top - floor, 0.0)
+
+
+def _edge(half: float) -> float:
+    """Metres to the side of a row at which most of its canopy ends, of the half width that holds it all."""
+    return max((half - BESIDE) / WIDER, BIN)
 
 
 class Sections(NamedTuple):
@@ -185,12 +202,12 @@ def _take_flagged(
                 at += 1
 
 
-@compiled
 def canopy_size(left: Values, height: Values, spacing: float, highest: float) -> tuple[float, float]:
     """Height and half width in metres that hold a row's canopy, on the whole: what lies beyond is not the row's.
 
-    The height is that of most points within a quarter of the spacing; the half width is where those of its upper half,
-    which neither weeds nor a cover crop reach, have thinned out, and half as much again, at the most half the spacing.
+    The height is that of most points within a quarter of the spacing, but for posts that stick out; the half width is
+    where those of its upper half, which neither weeds nor a cover crop reach, have thinned out, and half as much again,
+    at the most half the spacing.
 
     Parameters
     ----------
@@ -199,21 +216,43 @@ def canopy_size(left: Values, height: Values, spacing: float, highest: float) ->
     spacing, highest : float
         Metres to the next row, and of height above which there is no canopy.
     """
+    top = _top(left, height, 0.25 * spacing, highest)
+    if not top:
+        return highest, 0.5 * spacing
+    edge = _edge_at(left, height, 0.5 * spacing, (UPPER * top, highest))
+    return top, min(WIDER * edge + BESIDE, 0.5 * spacing)
+
+
+@compiled
+def _top(left: Values, height: Values, reach: float, highest: float) -> float:
+    """Height in metres of most points within reach of a row, but for posts; 0 without any."""
     levels, total = np.zeros(int(highest / BIN) + 1), 0
     for p in range(len(left)):
-        if LEAST <= height[p] <= highest and abs(left[p]) <= 0.25 * spacing:
+        if LEAST <= height[p] <= highest and abs(left[p]) <= reach:
             levels[int(height[p] / BIN)] += 1
             total += 1
     if total == 0:
-        return highest, 0.5 * spacing
-    bins, below = 1, levels[0]
-    while below < TOP * total:
-        below += levels[bins]
-        bins += 1
-    top = BIN * bins
-    across = np.zeros(int(0.5 * spacing / BIN) + 3)
+        return 0.0
+    bins = _order(levels, TOP * total)
+    post = STICKING * BIN * _order(levels, BULK * total)
+    if BIN * bins > post:
+        above, n = np.empty(len(left)), int(np.int64(0))  # with a plain 0 `is_post` would be compiled twice
+        for p in range(len(left)):
+            if post < height[p] <= highest and abs(left[p]) <= reach:
+                above[n] = left[p]
+                n += 1
+        if is_post(above, n):
+            bins = _order(levels, TOP * (total - n))
+    return BIN * bins
+
+
+@compiled
+def _edge_at(left: Values, height: Values, reach: float, levels: tuple[float, float]) -> float:
+    """Metres to the side of a row, up to reach, at which its points between two heights have thinned out."""
+    across = np.zeros(int(reach / BIN) + 3)
+    low, high = levels
     for p in range(len(left)):
-        if UPPER * top <= height[p] <= highest and abs(left[p]) < 0.5 * spacing:
+        if low <= height[p] <= high and abs(left[p]) < reach:
             across[int(abs(left[p]) / BIN)] += 1
     edge = 0
     for i in range(len(across)):
@@ -222,7 +261,32 @@ def canopy_size(left: Values, height: Values, spacing: float, highest: float) ->
     least = EDGE * across[edge]
     while edge + 2 < len(across) and across[edge] + across[edge + 1] >= 2 * least:
         edge += 1
-    return top, min(WIDER * edge * BIN + BESIDE, 0.5 * spacing)
+    return BIN * edge
+
+
+@compiled
+def _order(levels: Values, n: float) -> int:
+    """Bins of height below which n of the points of a histogram lie."""
+    bins, below = 1, levels[0]
+    while below < n:
+        below += levels[bins]
+        bins += 1
+    return bins
+
+
+@compiled
+def is_post(above: Values, n: int) -> bool:
+    """Whether the first n points that stand above some height, by metres across, are thin, if there are any.
+
+    Strays beside it don't make it wide. They lose their order.
+    """
+    if n == 0:
+        return False
+    first = int(np.int64(0))  # a plain 0 would have `quantile` compiled twice
+    middle = quantile(above, first, n, 0.5)
+    for i in range(n):
+        above[i] = abs(above[i] - middle)
+    return quantile(above, first, n, 0.5) <= THIN
 
 
 @compiled

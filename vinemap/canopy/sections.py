@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.canopy.points import Sections, canopy_floor, canopy_size
+from vinemap.canopy.points import USUAL_AREA, Sections, canopy_area, canopy_floor, canopy_size
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
@@ -70,7 +70,8 @@ def cut_sections(
     width, step : float
         Extent a of a section along γ, and distance b of sections along γ, in metres.
     min_points, max_width : int, float
-        Points of canopy that sections of a row are widened for, and metres to which they may be.
+        Points of canopy that sections of a row are widened for, more in canopies of more than a square metre, and
+        metres to which they may be.
     low, high : float
         Heights in metres between which points count as canopy; the lower is less in rows that are low.
     """
@@ -84,11 +85,13 @@ def cut_sections(
         soil_line = sample(dtm, at(curves[row], stations))
         canopied = _outside(gaps[gaps["row_id"] == numbers[row]], stations)
         position, level = stations[canopied], soil_line[canopied]
-        top, half = canopy_size(left, height, float(spacing[row]), high)
-        below = min(SOIL, canopy_floor(left, height, (top, half), float(spacing[row])))
+        top, half = size = canopy_size(left, height, float(spacing[row]), high)
+        floor = canopy_floor(left, height, size, float(spacing[row]))
+        below = min(SOIL, floor)
         canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
         length = max(len(position) * step, step)
-        a = max(width, min(max_width, min_points * length / max(canopy, 1)))
+        needed = min_points * max(1.0, canopy_area(size, floor) / USUAL_AREA)
+        a = max(width, min(max_width, needed * length / max(canopy, 1)))
         every = max(1, int(soil * a / length / SOIL_POINTS))
         n, index = _members(along, height, position, a / 2, (below, every))
         start = np.concatenate([[0], np.cumsum(n)])
