@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.jobs.estate import Arrival, arrivals
 from vinemap.jobs.plan import COLUMNS, FAILED, Outcome, in_table, plan_survey
-from vinemap.jobs.register import is_due
 from vinemap.jobs.survey import map_survey
 from vinemap.terminal import plain_errors, show
 
@@ -84,13 +82,9 @@ def _survey(arrival: Arrival, folder: Path) -> Night:
     try:
         own = paths.configuration(arrival.name)
         config = load_survey(own) if own.is_file() and own != paths.ESTATE else arrival.config
-        began, plan = time.time(), plan_survey(config, folder)
-        if plan.recipes:
-            outcomes = outcomes_of(config, folder)
-        else:  # what had to be read for that need not be read again
-            read = any(source.read >= began for source in plan.sources)
-            read |= bool(is_due(plan.register) or plan.due(plan.settled))
-            outcomes = list(map_survey(config, folder)) if read else plan.settled
+        # What is to be mapped has a flow of its own; where nothing is, pages and records are still made good.
+        needed = bool(plan_survey(config, folder).recipes)
+        outcomes = outcomes_of(config, folder) if needed else list(map_survey(config, folder))
     except BusyError as error:
         return Night(arrival.name, [], str(error))
     except VinemapError as error:

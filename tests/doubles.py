@@ -25,6 +25,7 @@ def follow(recipe, folder, *, piece=None, drafts=None, within=None):
         record = {
             "key": recipe.key,
             "parcel": recipe.parcel,
+            "survey": recipe.survey,
             "counts": {"rows": 3},
             "length_m": 12.5,
             "warnings": ["made up"],
@@ -37,6 +38,10 @@ def follow(recipe, folder, *, piece=None, drafts=None, within=None):
 
 def refuse():
     raise errors.InputError("no vines here")
+
+
+def lack():
+    raise errors.GridError("not without the grid")
 
 
 def die():
@@ -69,6 +74,7 @@ def kill():
 
 DEEDS = {
     "refuses": refuse,
+    "lacks": lack,
     "dies": die,
     "divides": divide,
     "hangs": hang,

@@ -19,6 +19,12 @@ class InputError(VinemapError):
     """A cloud, boundary or reference can't be used as it is."""
 
 
+class GridError(InputError):
+    """PROJ lacks a grid without which an input has no place; where it gets it, the same input will do."""
+
+    heals = True
+
+
 class OutsideError(InputError):
     """A cloud has no point in a parcel."""
 

@@ -10,7 +10,7 @@ import shapely
 from pyproj import CRS, Transformer
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from vinemap.errors import InputError
+from vinemap.errors import GridError, InputError
 from vinemap.geo.crs import LOCAL, from_wgs84, horizontal, metric_crs, parse_crs, stated, to_wgs84, vertical_name
 from vinemap.geo.place import check_place, doubts_of
 
@@ -112,7 +112,7 @@ def test_a_grid_that_a_crs_names_and_proj_lacks():
     may, must = (parse_crs(OWN_GRID.format(grid)) for grid in ("@nowhere.gsb,null", "nowhere.gsb"))
     (doubt,) = doubts_of(may, 400_000, 300_000)
     assert doubt.startswith("the accuracy of positions in WGS 84 is not known: PROJ lacks the grid nowhere.gsb for ")
-    with pytest.raises(InputError, match=r"a\.laz: .* can't be brought to WGS 84 without the grid nowhere\.gsb: give"):
+    with pytest.raises(GridError, match=r"a\.laz: .* can't be brought to WGS 84 without the grid nowhere\.gsb: give"):
         check_place(must, 400_000, 300_000, "a.laz")
 
 

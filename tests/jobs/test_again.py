@@ -15,6 +15,7 @@ from vinemap.errors import OutputError
 from vinemap.jobs import survey
 from vinemap.jobs.plan import CURRENT, DONE, FAILED
 from vinemap.product import recipe
+from vinemap.product.seasons.products import GONE, places_of
 
 
 def test_what_is_done_is_not_done_again(done):
@@ -75,9 +76,24 @@ def test_what_is_changed_is_done_again(done, what):
     states = done.states(**options)
     assert sorted(done.worked) == expected
     assert {parcel for parcel, state in states.items() if state == DONE} == set(expected)
-    assert set(states.values()) <= {DONE, CURRENT}
+    assert set(states.values()) <= {DONE, CURRENT} | ({GONE} if what == "a polygon less" else set())
     assert done.planned(**options) == []
     assert recipe.product_in(done.folder / "B")
+
+
+def test_a_parcel_by_another_name_is_counted_once(done):
+    """Its product by the old name stays; somebody who names parcels says nothing of the others."""
+    done.draw(A=0, C=2, **{"B Barbera": 1})
+    for _ in range(2):
+        outcomes = done.run()
+        assert {name for name, one in outcomes.items() if one.state == GONE} == {"B"}
+        assert outcomes["B"].reason.endswith(f"{done.folder / 'B'} stays, and counts nowhere")
+        assert [place.name for place in places_of(done.folder)] == ["A", "B Barbera", "C"]
+    assert (done.folder / "B" / "points.txt").is_file()
+    assert done.states(parcels=["A"]) == {"A": CURRENT}
+    assert [place.name for place in places_of(done.folder)] == ["A", "B Barbera", "C"]
+    done.draw(A=0, B=1, C=2)
+    assert done.states() == {"A": CURRENT, "B": CURRENT, "C": CURRENT, "B Barbera": GONE}
 
 
 def test_a_new_version_does_all_again(done, monkeypatch):
@@ -88,6 +104,13 @@ def test_a_new_version_does_all_again(done, monkeypatch):
 def test_a_cloud_that_moved_is_the_same(done):
     done.cloud = done.cloud.rename(done.cloud.with_name("june.las"))
     assert done.planned() == []
+
+
+def test_a_parcel_for_which_a_grid_was_lacking_is_tried_again(job):
+    job.draw(A=0, lacks=1)
+    for _ in range(2):
+        assert job.states()["lacks"] == FAILED
+        assert "lacks" in job.worked
 
 
 def test_settings_of_one_parcel_reach_its_work(job):

@@ -17,6 +17,7 @@ from vinemap.geo.boundaries import read_parcels
 from vinemap.jobs import survey
 from vinemap.jobs.plan import CURRENT, DONE, FAILED, OUTSIDE
 from vinemap.product import recipe
+from vinemap.product.seasons.products import GONE
 
 
 def test_parcels_that_are_not_in_the_cloud(job):
@@ -139,7 +140,7 @@ def test_a_single_polygon_and_none(job):
     job.draw(A=0)
     assert job.states() == {"A": DONE}
     job.boundaries.unlink()
-    assert job.states(boundaries=None) == {"may": DONE}
-    assert job.states(boundaries=None) == {"may": CURRENT}
+    assert job.states(boundaries=None) == {"may": DONE, "A": GONE}
+    assert job.states(boundaries=None) == {"may": CURRENT, "A": GONE}
     with pytest.raises(InputError, match=r"parcels\.geojson: no such file"):
         job.run()

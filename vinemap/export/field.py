@@ -17,6 +17,7 @@ from vinemap.errors import InputError
 from vinemap.export.lanes import lanes_between
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.geo.main import Corner, Origin, origin_of, to_main
+from vinemap.product.seasons.products import places_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -95,7 +96,7 @@ class Field(NamedTuple):
 
 
 def products_of(given: Path) -> list[Path]:
-    """The products that a path means: of a survey's folder all in it, of any other the path itself.
+    """The products that a path means: of a survey's folder those of its parcels, of any other the path itself.
 
     Raises
     ------
@@ -104,7 +105,7 @@ def products_of(given: Path) -> list[Path]:
     """
     if paths.run_record(given).is_file() or not paths.survey_record(given).is_file():
         return [given]
-    products = sorted(record.parent for record in given.glob(f"*/{paths.RUN}"))
+    products = places_of(given)
     if not products:
         raise InputError(f"{naming.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
     return products

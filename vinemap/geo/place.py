@@ -11,7 +11,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from vinemap.errors import InputError
+from vinemap.errors import GridError, InputError
 from vinemap.geo.crs import LOCAL, WGS84, code_of, horizontal, is_local, stated, transformer
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ def check_place(crs: CRS, x: float, y: float, of: str, *, remedy: str = GIVE) ->
     ------
     InputError
         If it doesn't, with what the reason may be, or there is no way from that CRS to WGS 84.
+    GridError
+        If there is one, but for a grid that PROJ lacks.
     """
     flat = horizontal(crs)
     area = _area(flat)
@@ -74,8 +76,11 @@ def check_place(crs: CRS, x: float, y: float, of: str, *, remedy: str = GIVE) ->
     try:
         transformer(flat, WGS84).transform(x, y)
     except ProjError as error:
-        why = f" without the grid {lacks}" if (lacks := _lacking(flat)) else ""
-        raise InputError(f"{of}: {_called(flat)} can't be brought to WGS 84{why}: {remedy}") from error
+        if lacks := _lacking(flat):
+            raise GridError(
+                f"{of}: {_called(flat)} can't be brought to WGS 84 without the grid {lacks}: {remedy}"
+            ) from error
+        raise InputError(f"{of}: {_called(flat)} can't be brought to WGS 84: {remedy}") from error
     if area is None:
         return
     if _is_near_zero(flat, area, x, y):

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinemap import paths
+from vinemap.cloud.pdal.engine import check_engines
 from vinemap.config.surveys import SurveyConfig, load_estate, load_survey
-from vinemap.errors import ConfigError
-from vinemap.geo.crs import parse_crs
+from vinemap.errors import ConfigError, InputError
 from vinemap.jobs.estate import arrivals
-from vinemap.jobs.register import known_of
+from vinemap.jobs.plan import plan_survey
 from vinemap.parcel import follow
-from vinemap.product.recipe import recipe_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +30,7 @@ def chosen(survey: str) -> tuple[SurveyConfig, Path]:
     path = Path(survey) if survey.endswith((".yaml", ".yml")) else paths.configuration(survey)
     if path.is_file() or not paths.ESTATE.is_file():
         config = load_survey(path)
-        return config, paths.survey_products(config.survey)
+        return config, products_of(config.survey)
     estate = load_estate(paths.ESTATE)
     found = {arrival.name: arrival for arrival in arrivals(estate)}
     if survey not in found:
@@ -39,7 +38,18 @@ def chosen(survey: str) -> tuple[SurveyConfig, Path]:
     arrival = found[survey]
     if not arrival.config:
         raise ConfigError(f"{survey}: {arrival.reason}")
-    return arrival.config, estate.products / survey
+    return arrival.config, products_of(survey)
+
+
+def products_of(survey: str) -> Path:
+    """Folder of a survey's products: in the estate's, where there is one, so that every night finds them.
+
+    Raises
+    ------
+    ConfigError
+        If the estate's configuration can't be read.
+    """
+    return load_estate(paths.ESTATE).products / survey if paths.ESTATE.is_file() else paths.survey_products(survey)
 
 
 def map_one(config: SurveyConfig, parcel: str, *, step: Callable[..., Any]) -> Summary:
@@ -50,20 +60,14 @@ def map_one(config: SurveyConfig, parcel: str, *, step: Callable[..., Any]) -> S
     VinemapError
         As that function.
     """
-    survey = config.survey
-    recipe = recipe_of(
-        config.cloud or paths.survey_cloud(survey),
-        parcel=parcel,
-        boundary=config.boundaries or paths.survey_boundaries(survey),
-        crs=parse_crs(config.crs) if config.crs else None,
-        survey=survey,
-        rows=config.rows,
-        rows_crs=parse_crs(config.rows_crs) if config.rows_crs else None,
-        vines=config.vines,
-        **dict(config.of_parcel(parcel)),
-    )
-    known = None if config.rows else known_of(config, recipe.flown, {parcel: recipe.boundary})
-    if known:
-        recipe = recipe._replace(known=known.rows.get(parcel))
-    products = paths.survey_products(survey)
+    products = products_of(config.survey)
+    alone = config.boundaries is None and not paths.survey_boundaries(config.survey).exists()
+    check_engines(config.all_settings())
+    chosen = config if alone else config.model_copy(update={"parcels": [parcel]})
+    plan = plan_survey(chosen, products, again=True)
+    recipe = next((recipe for recipe in plan.recipes if recipe.parcel == parcel), None)
+    if recipe is None:
+        why = [outcome.reason for outcome in plan.settled if outcome.parcel == parcel]
+        one = f"{parcel}: the survey {config.survey} has no boundaries, so that it is one parcel: {config.survey}"
+        raise InputError("; ".join(why) or one)
     return follow(recipe, paths.parcel_folder(products, parcel), within=products, step=step)

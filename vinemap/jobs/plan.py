@@ -18,6 +18,7 @@ from vinemap.geo.lines import KnownRows, read_rows, rows_of
 from vinemap.jobs.register import Known, candidates_due, known_of
 from vinemap.product.recipe import VINES, Recipe, Source, fit_for, flown, product_in, read_clouds, read_source, vines_of
 from vinemap.product.record import in_words
+from vinemap.product.seasons.products import GONE, whose
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from vinemap.geo.boundaries import Boundary
 
 DONE, CURRENT, OUTSIDE, LEFT, FAILED = "done", "up to date", "not in the cloud", "left out", "failed"
-"""What can become of a parcel."""
+"""What can become of a parcel, beside that it is ``GONE``."""
 
 
 @dataclass(frozen=True)
@@ -130,23 +131,15 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     plan = Plan(sources, date, [], [*lost, *strays], listed, register)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
     hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
-    taken: dict[str, str] = {}
-    caseless = paths.is_caseless(folder)
     for name, polygon in polygons.items():
         if isinstance(polygon, InputError):
             state = LEFT if isinstance(polygon, NoAreaError) and not listed else FAILED
             plan.settled.append(Outcome(name, state, reason=str(polygon)))
-            continue
-        try:
-            parcel = check_parcel(name)
-        except ConfigError as error:
-            plan.settled.append(Outcome(name, FAILED, reason=str(error)))
-            continue
+    caseless = paths.is_caseless(folder)
+    named, nameless = _named(_whole(polygons), caseless=caseless)
+    plan.settled.extend(nameless)
+    for parcel, polygon in named.items():
         place = paths.parcel_folder(folder, parcel)
-        if (other := taken.setdefault(place.name.casefold() if caseless else place.name, parcel)) != parcel:
-            reason = f"its folder would be that of {other!r}, {place.name}: give one of the two another name"
-            plan.settled.append(Outcome(parcel, FAILED, reason=reason))
-            continue
         own = config.of_parcel(parcel)
         boundary, remarks = polygon or (None, ())
         recipe = Recipe(
@@ -160,8 +153,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             flown=date,
             survey=config.survey,
             remarks=remarks,
-            known=rows.get(name),
-            vines=vines.get(name),
+            known=rows.get(parcel),
+            vines=vines.get(parcel),
         )
         key = recipe.key
         product = None if again else product_in(place)
@@ -172,7 +165,43 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             plan.settled.append(hopeless[parcel])
         else:
             plan.recipes.append(recipe)
+    if not listed:
+        plan.settled.extend(_gone(folder, config.survey, polygons, caseless=caseless))
     return plan
+
+
+def _named(parcels: Mapping[str, Parcel | None], *, caseless: bool) -> tuple[dict[str, Parcel | None], list[Outcome]]:
+    """Parcels whose names can name folders, each another, and what is to be known of the rest."""
+    named: dict[str, Parcel | None] = {}
+    wrong, taken = [], {}
+    for name, parcel in parcels.items():
+        try:
+            check_parcel(name)
+        except ConfigError as error:
+            wrong.append(Outcome(name, FAILED, reason=str(error)))
+            continue
+        folder = paths.parcel_folder(Path(), name).name
+        if (other := taken.setdefault(folder.casefold() if caseless else folder, name)) != name:
+            reason = f"its folder would be that of {other!r}, {folder}: give one of the two another name"
+            wrong.append(Outcome(name, FAILED, reason=reason))
+            continue
+        named[name] = parcel
+    return named, wrong
+
+
+def _gone(folder: Path, survey: str, parcels: Iterable[str], *, caseless: bool) -> list[Outcome]:
+    """What is to be known of products of a survey whose parcels it hasn't any more."""
+
+    def name(place: Path) -> str:
+        return place.name.casefold() if caseless else place.name
+
+    there = {name(paths.parcel_folder(folder, parcel)) for parcel in parcels}
+    others = sorted(record.parent for record in folder.glob(f"*/{paths.RUN}") if name(record.parent) not in there)
+    return [
+        Outcome(one[0], GONE, reason=f"no polygon has this name any more: {place} stays, and counts nowhere")
+        for place in others
+        if (one := whose(place)) and one[1] == survey
+    ]
 
 
 def _known_rows(
@@ -222,9 +251,14 @@ def _registered(
     return register
 
 
+def _whole(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Parcel | None]:
+    """The parcels whose polygons could be read, or that need none."""
+    return {name: one for name, one in polygons.items() if not isinstance(one, InputError)}
+
+
 def _bounds(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Boundary | None]:
-    """Boundaries of the parcels that have one, or need none."""
-    return {name: one.boundary if one else None for name, one in polygons.items() if not isinstance(one, InputError)}
+    """Boundaries of those."""
+    return {name: one.boundary if one else None for name, one in _whole(polygons).items()}
 
 
 def _earlier(folder: Path) -> _Earlier:

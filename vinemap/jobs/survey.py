@@ -225,7 +225,7 @@ def _dealt(
     for k in sorted(range(len(pieces)), key=lambda k: -sizes[k]):
         recipe, piece = recipes[k], pieces[k]
         if isinstance(piece, InputError):
-            yield recipe, Outcome(recipe.parcel, FAILED, reason=str(piece), key=recipe.key)
+            yield recipe, Outcome(recipe.parcel, FAILED, reason=str(piece), key=recipe.key, heals=piece.heals)
         elif sizes[k] == 0 and not plan.listed:
             yield recipe, Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
         else:
@@ -261,8 +261,8 @@ def _run(
     except OutsideError as error:
         return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=key)
     except VinemapError as error:
-        known = isinstance(error, (InputError, ConfigError))
-        return failed(seconds=time.perf_counter() - began, reason=str(error), heals=not known)
+        heals = error.heals or not isinstance(error, (InputError, ConfigError))
+        return failed(seconds=time.perf_counter() - began, reason=str(error), heals=heals)
     except Exception as error:  # noqa: BLE001 - a fault of our own costs no other parcel
         return failed(reason=own_fault(error), heals=True)
     finally:

@@ -211,17 +211,11 @@ def recipe_of(
     settings: Settings | None = None,
     crs: CRS | None = None,
     origin: Origin | None = None,
-    survey: str | None = None,
     rows: Path | None = None,
     rows_crs: CRS | None = None,
     vines: Path | None = None,
 ) -> Recipe:
-    """Gather what the product of one parcel depends on, as :func:`vinemap.parcel.map_parcel` is told.
-
-    Parameters
-    ----------
-    survey : str, optional
-        Name of the survey whose parcels' products lie side by side.
+    """Gather what the product of one parcel, of no survey, depends on, as :func:`vinemap.parcel.map_parcel` is told.
 
     Raises
     ------
@@ -253,7 +247,7 @@ def recipe_of(
         points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), {parcel: polygon})[parcel]
         if len(points) == 0:
             raise InputError(f"{vines}: none of its vines stands in the parcel: is its CRS the right one?")
-    given = fit_for(settings or Settings(), files), crs, origin, date, survey, remarks, known, points
+    given = fit_for(settings or Settings(), files), crs, origin, date, None, remarks, known, points
     return Recipe(parcel, files, sources, polygon, *given)
 
 

@@ -27,6 +27,7 @@ from vinemap.cloud.files import CLOUDS
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.evaluate.unmapped import TALL
 from vinemap.geo.crs import WGS84, is_local, project
+from vinemap.product.seasons.products import places_of
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
@@ -253,11 +254,9 @@ class _Parcel(NamedTuple):
 
 
 def _parcels(folder: Path, survey: str) -> Iterator[_Parcel]:
-    for product in sorted(folder.iterdir()):
+    for product in places_of(folder):
         path = paths.stac_item(product, product.name)
         try:
-            if not paths.run_record(product).is_file():
-                continue
             item = json.loads(path.read_text(encoding="utf-8"))
             if item["collection"] != survey:
                 continue

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 COLUMNS = ("row_id", "label", "spacing_m", *MEASURES)
 """What is read of rows, beside what wasn't seen of them."""
+GONE = "no longer a parcel"
+"""State, in a survey's record, of a parcel that its boundaries have no more, though its product is still there."""
 SHARED = 0.3
 """Share of the smaller of two outlines that both hold, from which on they are the same parcel's."""
 
@@ -52,14 +54,32 @@ class Product(NamedTuple):
 
 
 def read_products(folder: Path) -> Iterator[Product]:
-    """Products in a folder of them, as far as their records can be read."""
-    try:
-        places = sorted(folder.iterdir())
-    except OSError:
-        return
-    for place in places:
+    """Products of a survey's parcels, as far as their records can be read."""
+    for place in places_of(folder):
         if product := read_product(place):
             yield product
+
+
+def places_of(folder: Path) -> list[Path]:
+    """Folders of the products of a survey's parcels, without those that are gone, as by another name."""
+    try:
+        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
+        gone = {paths.parcel_folder(folder, str(one["parcel"])) for one in record["parcels"] if one["state"] == GONE}
+    except (OSError, ValueError, KeyError, TypeError):
+        gone = set()
+    try:
+        return sorted(path.parent for path in folder.glob(f"*/{paths.RUN}") if path.parent not in gone)
+    except OSError:
+        return []
+
+
+def whose(place: Path) -> tuple[str, str] | None:
+    """Parcel and survey of the product in a folder, as far as its record tells."""
+    try:
+        record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
+        return str(record["parcel"]), str(record["survey"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def read_product(place: Path) -> Product | None:
