@@ -173,7 +173,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
 def _named(parcels: Mapping[str, Parcel | None], *, caseless: bool) -> tuple[dict[str, Parcel | None], list[Outcome]]:
     """Parcels whose names can name folders, each another, and what is to be known of the rest."""
     named: dict[str, Parcel | None] = {}
-    wrong, taken = [], {}
+    taken: dict[str, str] = {}
+    wrong = []
     for name, parcel in parcels.items():
         try:
             check_parcel(name)
