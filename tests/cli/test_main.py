@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import shapely
 from commands import assert_refused, vinemap
+from squares import write_cloud
 
 from vinemap.simulate.survey import write_survey
 from vinemap.stages import STAGES
@@ -60,6 +61,24 @@ def test_classified_clouds_and_plain_meshes_on_demand(tmp_path, survey):
     assert record["settings"]["product"] == {"classified": True, "plain": True, "audit": False, "geoid": None}
     assert "small_classified.laz" in record["files"]
     assert 0 < record["modelling"]["over"] < 0.09
+
+
+def test_a_cloud_does_not_take_the_place_of_another_unseen(tmp_path):
+    """Whose long name begins alike; of one with the same name it is said, as the same survey may come again."""
+    long = "Neive, the long hill by the river, flown at sixty metres, processed, "
+    for k, cloud in enumerate(("may/cloud.las", "june/cloud.las", f"{long}1.las", f"{long}2.las")):
+        (tmp_path / cloud).parent.mkdir(exist_ok=True)
+        write_cloud(tmp_path / cloud, seed=k)
+    may, june, one = (
+        vinemap("run", cloud, cwd=tmp_path) for cloud in ("may/cloud.las", "june/cloud.las", f"{long}1.las")
+    )
+    assert "replaces" not in may.stdout
+    assert june.stdout.endswith("; it replaces that of another cloud.las\n")
+    assert one.returncode == 0
+    assert_refused(
+        vinemap("run", f"{long}2.las", cwd=tmp_path),
+        f"holds the product of {long}1.las: give another folder with --out",
+    )
 
 
 def test_settings_and_names_from_the_command_line(tmp_path, survey):

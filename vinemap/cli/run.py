@@ -55,12 +55,18 @@ def run(
     from vinemap.config.names import check_parcel
     from vinemap.config.settings import Settings
     from vinemap.config.surveys import load_settings
+    from vinemap.errors import OutputError
     from vinemap.geo.crs import parse_crs
+    from vinemap.product.recipe import made_of
     from vinemap.warm import ahead
 
-    survey = paths.named_by(cloud_files(clouds))
+    files = cloud_files(clouds)
+    survey = paths.named_by(files)
     name = check_parcel(parcel) if parcel is not None else survey
     folder = out or paths.product_folder(survey, name)
+    earlier = made_of(folder)
+    if out is None and earlier and not any(file.name in earlier for file in files):
+        raise OutputError(f"{folder}: holds the product of {', '.join(earlier)}: give another folder with --out")
     chosen = load_settings(settings) if settings else Settings()
     extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}
     options = {
@@ -77,4 +83,6 @@ def run(
         from vinemap.parcel import map_parcel
 
         summary = map_parcel(clouds, folder, parcel=name, step=step, **options)
-    click.echo(summary.line())
+    now = made_of(folder)
+    others = [file.name for file in files if earlier.get(file.name, now.get(file.name)) != now.get(file.name)]
+    click.echo(summary.line() + (f"; it replaces that of another {others[0]}" if others else ""))

@@ -297,3 +297,12 @@ def product_in(folder: Path) -> Product | None:
         return Product(*known, tuple(record["warnings"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def made_of(folder: Path) -> dict[str, str]:
+    """Names of the files that the product in a folder was made of, and their SHA-256; nothing where there is none."""
+    try:
+        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        return {str(one["file"]): str(one["sha256"]) for one in record["inputs"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
