@@ -1,6 +1,5 @@
 """The chain and the jobs as Prefect flows."""
 
-import logging
 import os
 import tempfile
 from pathlib import Path
@@ -8,11 +7,11 @@ from pathlib import Path
 # Prefect reads these when it is first imported. Its log goes to its own server; the terminal shows ours.
 os.environ.setdefault("PREFECT_LOGGING_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_LOGGING_LEVEL", "CRITICAL")
+# It gives every library's log to the terminal, too, and that of its own services when that is no more.
+os.environ.setdefault("PREFECT_LOGGING_ROOT_LEVEL", "CRITICAL")
 os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
 os.environ.setdefault("DO_NOT_TRACK", "1")
 # A flow without a server starts one of its own, which takes its time on a busy machine.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
 if "PREFECT_HOME" not in os.environ and not os.access(Path.home(), os.W_OK):
     os.environ["PREFECT_HOME"] = str(Path(tempfile.gettempdir()) / f"prefect-{os.getuid()}")
-# Prefect gives every library's log to the terminal; what laspy has to say is in our own error.
-logging.getLogger("laspy").setLevel(logging.CRITICAL)

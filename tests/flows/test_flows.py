@@ -103,6 +103,21 @@ def refusals(place):
     return dict(zip((words for words, _ in WRONG), json.loads(done.stdout), strict=True))
 
 
+def test_prefects_services_say_nothing_once_all_is_over(place):
+    """What stderr was while the flow ran is closed then."""
+    code = (
+        "import logging\n"
+        "from vinemap.terminal import hushed\n"
+        "with hushed():\n"
+        "    import flows.parcel\n"
+        "    from prefect.logging.configuration import setup_logging\n"
+        "    setup_logging()\n"
+        "logging.getLogger('APILogWorker').warning('1 items remaining')\n"
+    )
+    done = alone(place, "-c", code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 @pytest.mark.parametrize(("words", "said"), WRONG)
 def test_wrong_words(refusals, words, said):
     code, line = refusals[words]
