@@ -14,6 +14,7 @@ from vinemap import paths
 from vinemap.cloud.files import cloud_files, is_cloud
 from vinemap.cloud.formats import ept
 from vinemap.cloud.formats.identity import digest_of, stamp_of
+from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.las import read_cloud
 from vinemap.compute import extras
 from vinemap.errors import DependencyError, InputError
@@ -158,6 +159,26 @@ def test_noise_and_what_is_no_number_are_left_out(tmp_path):
     assert read_cloud(tmp_path / "a.xyz", crs=UTM).xyz[:, 0].tolist() == [414700.5, 414703.5]
 
 
+NAMED = [
+    ("X,Y,Height_Above_Ground,Z", "124"),
+    ("Height (above ground),Elevation (m),Easting (m),Northing (m)", "342"),
+    ("N,X,Y,Z", "234"),
+    ("N,lon,lat,Height", "234"),
+    ("No,lat,lon,h,E,N", "564"),
+    ("z_dtm,Y_utm,X_utm,z", "324"),
+    ("h,Altitude,North,East", "432"),
+]
+
+
+@pytest.mark.parametrize(("names", "order"), NAMED)
+def test_columns_are_told_by_the_likeliest_names(tmp_path, names, order):
+    xyz = dict(zip(order, (414_700, 4_940_700, 469), strict=True))
+    values = [str(xyz.get(str(k + 1), 1)) for k in range(names.count(",") + 1)]
+    (tmp_path / "a.csv").write_text(f"{names}\n{','.join(values)}\n")
+    (found,) = read_text(tmp_path / "a.csv").chunks
+    assert found.tolist() == [[414_700, 4_940_700, 469]]
+
+
 def test_what_stands_before_the_points(tmp_path, points):
     whole = formats.write_ply(tmp_path / "a.ply", points, before=HEAD)
     data = whole.read_bytes().replace(b"end_header\n", b"end_header\n" + bytes(16), 1)
@@ -182,6 +203,8 @@ WRONG = [
     ("a.ply", b"ply\nformat ascii 1.0\nvertices 3\n", "its header has a line 'vertices 3'"),
     ("a.pcd", b"VERSION .7\nFIELDS x y z\n", "can't be read as PCD: it doesn't begin as such a file"),
     ("a.xyz", b"one two three\nfour five six\n", "no line of it begins with x, y and z"),
+    ("a.csv", b"X,Y,Z_dsm,z_dtm\n1,2,3,4\n", "any of its columns Z_dsm, z_dtm may be z: rename what isn't"),
+    ("a.csv", b"X,Y,Height_above_ground\n1,2,3\n", r"its names \(X, Y, Height_above_ground\) say x and y, but no z"),
     ("a.xyz", bytes(100), "can't be read as text: it is packed"),
     ("a.xyz", b"414700 4940700 460\nbroken off here\n", r"can't be read as text \(could not convert"),
     ("a.tif", b"II*\0 no raster", "can't be read as GeoTIFF"),

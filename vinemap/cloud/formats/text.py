@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.cloud.formats.told import CHUNK, Header, Points, is_class, reading, usable
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
 BEGINNING = 65_536
 """Bytes that tell how a file is written."""
 COMMENTS = ("#", "//", ";", "%")
-NAMES = (
-    {"x", "e", "east", "easting", "lon", "long", "longitude"},
-    {"y", "n", "north", "northing", "lat", "latitude"},
-    {"z", "h", "height", "elevation", "alt", "altitude"},
-)
-"""What columns of x, y and z are called."""
+EASTS = (("x",), ("easting", "east", "e"), ("longitude", "lon", "long"))
+NORTHS = (("y",), ("northing", "north", "n"), ("latitude", "lat"))
+ELEVATIONS = ("z", "elevation", "altitude", "alt", "height", "h")
+"""What columns of x, y and z are called, the likeliest first; of the former two those of one kind go together."""
+ABOVE_GROUND = re.compile(r"h(eight)?[\W_]*above|[\W_]agl\b")
+"""Names of heights that are no elevations."""
 NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 
 
@@ -43,7 +44,7 @@ def read_text(path: Path) -> Points:
     Raises
     ------
     InputError
-        If no x, y and z can be told.
+        If no x, y and z can be told, or more than one column may be one of them.
     """
     with reading(path, "text"), path.open("rb") as stream:
         beginning = stream.read(BEGINNING)
@@ -61,23 +62,45 @@ def _form(lines: Sequence[str], path: Path) -> _Form:
             words = re.split(sep, bare)
             if len(words) < 3 or (sep == "," and re.fullmatch(r"[-+]?\d+,\d+(\s.*)?", bare)):
                 continue
-            cleaned = [word.strip(" \"'").lower() for word in words]
+            cleaned = [word.strip(" \"'") for word in words]
             if line.strip().startswith(COMMENTS) or not all(map(NUMBER.fullmatch, cleaned[:3])):
-                if len(_axes(cleaned)) == 3:
-                    names = cleaned
+                names = max(cleaned, names, key=lambda some: sum(map(bool, _axes(some))))
                 continue
-            columns = _axes(names) if len(names) == len(cleaned) else [0, 1, 2]
-            classes = next((k for k, name in enumerate(names) if is_class(name)), None)
+            told = names if len(names) == len(cleaned) else []
+            classes = next((k for k, name in enumerate(told) if is_class(name)), None)
             decimal = "," if sep != "," and any("," in word for word in cleaned[:3]) else "."
-            return _Form(skip, sep, decimal, (columns[0], columns[1], columns[2]), classes)
+            return _Form(skip, sep, decimal, _columns(told, path), classes)
     raise InputError(f"{path}: no line of it begins with x, y and z, nor do names say which columns they are")
 
 
-def _axes(names: Sequence[str]) -> list[int]:
-    """Columns of x, y and z, as far as their names tell: with or without a unit, as ``X(m)``."""
-    plain = [re.split(r"[\[(_ ]", name)[0] for name in names]
-    found = [next((k for k, name in enumerate(plain) if name in axis), -1) for axis in NAMES]
-    return [k for k in found if k >= 0]
+def _columns(names: Sequence[str], path: Path) -> tuple[int, int, int]:
+    """Columns of x, y and z: those that names tell, or else the first three."""
+    x, y, z = axes = _axes(names)
+    if not x:
+        return 0, 1, 2
+    if not z:
+        raise InputError(f"{path}: its names ({', '.join(names)}) say x and y, but no z: call the elevations' column z")
+    for axis, found in zip("xyz", axes, strict=True):
+        if len(found) > 1:
+            alike = ", ".join(names[k] for k in found)
+            raise InputError(f"{path}: any of its columns {alike} may be {axis}: rename what isn't")
+    return x[0], y[0], z[0]
+
+
+def _axes(names: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
+    """Columns that may be x, y and z by the likeliest of their names: with or without a unit, or more, behind it."""
+    lower = ["" if ABOVE_GROUND.search(name.lower()) else name.lower() for name in names]
+    alone, first = ([re.split(end, name)[0] for name in lower] for end in (r"\s*[\[(]", r"[\[(_ ]"))
+    kinds = [*zip(EASTS, NORTHS, strict=True), *product(EASTS, NORTHS)]
+    plans = ((_called(east, by), _called(north, by)) for by in (alone, first) for east, north in kinds)
+    x, y = next((plan for plan in plans if all(plan)), ([], []))
+    return x, y, _called(ELEVATIONS, alone) or _called(ELEVATIONS, first)
+
+
+def _called(words: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Columns with the first of some words that is a name."""
+    word = next((word for word in words if word in names), None)
+    return [k for k, name in enumerate(names) if name == word]
 
 
 def _read(path: Path, form: _Form) -> Generator[Floats]:
