@@ -1,5 +1,7 @@
 """What a survey's own file says, and the estate's for all."""
 
+from pathlib import Path
+
 import pytest
 from arriving import NOW, found, polygons, put, reasons
 
@@ -19,6 +21,22 @@ def test_its_own_file(clouds, place):
     assert (arrival.config.settings.polygon.c, arrival.config.job.limit) == (9, 60)
     (place / "may" / "survey.yaml").write_text(f"cloud: {place / 'may' / 'raw' / 'b.laz'}\n")
     assert found(place)[0].config.cloud == place / "may" / "raw" / "b.laz"
+
+
+def test_its_own_file_names_an_address(clouds, place):
+    (place / "may").mkdir()
+    put(clouds["laz 1.4"], place / "may" / "raw" / "b.laz")
+    (place / "may" / "survey.yaml").write_text("cloud: [https://example.org/may.copc.laz, raw/b.laz]\n")
+    (arrival,) = found(place)
+    assert arrival.config.cloud == [Path("https://example.org/may.copc.laz"), place / "may" / "raw" / "b.laz"]
+
+
+def test_its_own_file_names_a_pipeline(clouds, place):
+    put(clouds["laz 1.4"], place / "may" / "a.laz")
+    own = "settings: &own {ground: {engine: pdal, pipeline: mine.json}}\noverrides: {A: {settings: *own}}\n"
+    (place / "may" / "survey.yaml").write_text(own)
+    config = found(place)[0].config
+    assert [config.of_parcel(name).settings.ground.pipeline for name in "AB"] == [place / "may" / "mine.json"] * 2
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
+from vinemap import naming
 from vinemap.config.names import Name, ParcelName, check_parcel
 from vinemap.config.settings import Options, Settings
 from vinemap.config.yaml_files import checked_by, merge, nearest, read_yaml, validated
@@ -138,7 +139,7 @@ class EstateConfig(_Surveys):
         if not isinstance(stated, dict):
             raise ConfigError(f"{own}: holds no keys: write it like the estate's own file")
         if own:
-            stated |= {key: _beside(own, stated[key]) for key in FILES if stated.get(key)}
+            _place(stated, own.parent)
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}
@@ -148,9 +149,20 @@ class EstateConfig(_Surveys):
         return validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
 
 
-def _beside(own: Path, named: Any) -> Any:
-    """Files that a survey's own file names, from its folder on."""
-    return [own.parent / str(one) for one in named] if isinstance(named, list) else own.parent / str(named)
+def _place(stated: dict[str, Any], folder: Path) -> None:
+    """Let files that a survey's own file names be named from its folder on; addresses stay as they are."""
+    stated |= {key: _beside(folder, stated[key]) for key in FILES if stated.get(key)}
+    overrides = stated.get("overrides")
+    for part in (stated, *(overrides.values() if isinstance(overrides, dict) else ())):
+        match part:
+            case {"settings": {"ground": {"pipeline": str(named)} as ground}}:
+                ground["pipeline"] = _beside(folder, named)
+
+
+def _beside(folder: Path, named: Any) -> Any:
+    if isinstance(named, list):
+        return [_beside(folder, one) for one in named]
+    return named if naming.url_of(Path(str(named))) else folder / str(named)
 
 
 def choose_parcel(config: SurveyConfig, name: str) -> str:
