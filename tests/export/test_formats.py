@@ -148,6 +148,16 @@ def test_products_without_rows_or_lanes(tmp_path, product):
     assert sorted(path.name for path in (out / NAME).iterdir()) == ["isoxml", "nav2"]
 
 
+@pytest.mark.parametrize("column", ["row_id", "label", "block", "geometry"])
+def test_a_row_drawn_by_hand(tmp_path, product, column):
+    drawn = few(product, tmp_path / "drawn", 3)
+    rows = pyogrio.read_dataframe(drawn / f"{NAME}.gpkg", layer="rows").astype({"row_id": "Int64", "block": "Int64"})
+    rows.loc[1, column] = None
+    pyogrio.write_dataframe(rows, drawn / f"{NAME}.gpkg", layer="rows", geometry_type="LineString Z")
+    with pytest.raises(InputError, match=rf"{NAME}\.gpkg: row with fid 2 has no {column}: fill that in, or delete"):
+        list(export_products([drawn], tmp_path / "out", formats=["geojson"]))
+
+
 def test_wrong_products_and_places(tmp_path, product):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=r"file.*can't be written"):

@@ -141,18 +141,26 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     Raises
     ------
     InputError
-        If it is no whole product, or has no row, or no lane where one is wanted.
+        If it is no whole product, or has no row, or one without number, name, block or line, or no lane where one is
+        wanted.
     """
     folder, record = read_record(product)
     parcel, origin = record["parcel"], origin_of(record["origin"])
     path = paths.geopackage(folder, parcel)
     try:
-        layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("rows", "row_ends", "gaps", "parcel")}
+        rows = pyogrio.read_dataframe(path, layer="rows", fid_as_index=True)
+        layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("row_ends", "gaps", "parcel")}
     except (DataSourceError, DataLayerError) as error:
         raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
-    rows = layers["rows"].sort_values("row_id", ignore_index=True)
     if len(rows) == 0:
         raise InputError(f"{naming.shown(path)}: has no row to export")
+    for column in ("row_id", "label", "block", "geometry"):
+        if (lacking := rows[column].isna()).any():
+            raise InputError(
+                f"{naming.shown(path)}: row with fid {lacking.idxmax()} has no {column}: fill that in, or delete the "
+                "row, or map the parcel with it among known rows (--rows)"
+            )
+    rows = rows.sort_values("row_id", ignore_index=True)
     bounded = bool(record.get("bounded"))
     within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
