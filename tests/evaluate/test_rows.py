@@ -248,6 +248,24 @@ def test_read_lines_of_one_parcel(tmp_path):
         read_lines(path, parcel="X")
 
 
+COMPOSED, APART = "Vigna L\u00e0", "Vigna La\u0300"
+
+
+@pytest.mark.parametrize(
+    ("told", "asked"),
+    [(7.0, "7"), ("North  3 ", "North 3"), ("North 3", " North  3"), (APART, COMPOSED), (COMPOSED, APART)],
+)
+def test_names_of_parcels_are_found_as_they_are_meant(tmp_path, told, asked):
+    frame(line((0, 0), (9, 0)), line((0, 2), (9, 2)), parcel=[told, None]).to_file(tmp_path / "lines.gpkg")
+    assert len(read_lines(tmp_path / "lines.gpkg", parcel=asked)) == 1
+
+
+def test_read_lines_without_columns(tmp_path):
+    REFERENCE.to_file(tmp_path / "lines.geojson")
+    with pytest.raises(InputError, match="has 'G' in a column"):
+        read_lines(tmp_path / "lines.geojson", parcel="G")
+
+
 def test_read_lines_of_an_empty_layer(tmp_path):
     path = tmp_path / "nothing.gpkg"
     frame().to_file(path, layer="drawn", geometry_type="Unknown")

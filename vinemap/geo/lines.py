@@ -324,7 +324,8 @@ def read_lines(path: str | Path, layer: str | None = None, *, parcel: str | None
         raise InputError(f"{path}: layer {layer} holds {', '.join(other)}; give a layer of lines, one a vine row")
     if parcel is None:
         return lines
-    named = lines[(lines.drop(columns="geometry").astype(str) == parcel).any(axis=1)]
+    words = lines.drop(columns="geometry").apply(words_of)
+    named = lines[words.eq(words_of(pd.Series([parcel]))[0]).any(axis=1)]
     if len(named) == 0:
         raise InputError(f"{path}: no line of layer {layer} has {parcel!r} in a column: check the parcel's name")
     return named
@@ -343,8 +344,6 @@ def _line_layer(path: Path, layer: str | None) -> str:
     lines = [name for name, kind in kinds.items() if "LineString" in kind]
     lines = lines or [name for name, kind in kinds.items() if kind == "Unknown"]
     if len(lines) != 1:
-        raise InputError(
-            f"{path}: {'no layer' if not lines else 'several layers'} of lines among {names}; "
-            f"name the layer of vine rows {ROW_LAYER}"
-        )
+        what = "several layers" if lines else "no layer"
+        raise InputError(f"{path}: {what} of lines among {names}; name the layer of vine rows {ROW_LAYER}")
     return lines[0]
