@@ -27,6 +27,7 @@ class _Handler(BaseHTTPRequestHandler):
             body = data
         self.send_header("Content-Length", str(len(body)))
         self.send_header("ETag", server.tag)
+        self.send_header("Last-Modified", server.modified)
         self.end_headers()
         server.asked += 1
         if first_of(server) or len(body) < 2:
@@ -69,6 +70,7 @@ def serving(folder, *, ranges=True, breaks=0, stalls=0, silence=1.0, good=1, ref
     server = _Server(("127.0.0.1", 0), _Handler)
     server.folder, server.ranges, server.breaks, server.stalls = folder, ranges, breaks, stalls
     server.silence, server.good, server.refusals, server.tag = silence, good, list(refusals), '"1"'
+    server.modified = ""
     server.sent = server.asked = 0
     server.url = f"http://127.0.0.1:{server.server_address[1]}"
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)

@@ -131,3 +131,12 @@ def test_a_file_that_changes_is_another(folder):
         server.tag = '"3"'
         with pytest.raises(BusyError, match="changed while it was read"):
             file.fetch(5000, 6000)
+
+
+@pytest.mark.parametrize(
+    ("told", "when"), [("Thu, 01 Jan 1970 00:00:05 GMT", 5), ("", 0), ("0", 0), (f"1 Jan 1970 {'9' * 20}:00 GMT", 0)]
+)
+def test_a_servers_date_that_is_none_counts_as_none(folder, told, when):
+    with serving(folder) as server:
+        server.modified = told
+        assert stamp_of(address(server))[1] == when * 10**9

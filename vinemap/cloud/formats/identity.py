@@ -26,9 +26,8 @@ def stamp_of(path: Path) -> tuple[int, ...]:
     """
     if naming.url_of(path):
         file = Ranges(path)
-        when = parsedate_to_datetime(file.modified).timestamp() if file.modified else 0
         number = int.from_bytes(hashlib.sha256(file.tag.encode() + file.beginning).digest()[:7], "big")
-        return file.size, int(when * 1e9), 0, number
+        return file.size, _time_of(file.modified), 0, number
     stats = [part.stat() for part in parts_of(path)]
     return (
         sum(stat.st_size for stat in stats),
@@ -36,6 +35,14 @@ def stamp_of(path: Path) -> tuple[int, ...]:
         max(stat.st_ctime_ns for stat in stats),
         stats[0].st_ino if len(stats) == 1 else len(stats),
     )
+
+
+def _time_of(told: str) -> int:
+    """Time (ns) that a server tells; 0 if it tells none, or what is no date."""
+    try:
+        return int(parsedate_to_datetime(told).timestamp() * 1e9)
+    except (ValueError, OverflowError):
+        return 0
 
 
 def digest_of(path: Path) -> str:
