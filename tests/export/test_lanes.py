@@ -263,6 +263,12 @@ def test_what_comes_back():
         assert (comes_back(drawn, AROUND.difference(POND)) == back).all()
 
 
+def test_parts_of_a_lane_beyond_z():
+    holes = shapely.union_all([shapely.box(5 * k, 0.5, 5 * k + 1, 2) for k in range(1, 28)])
+    lanes = lanes_between(field(row(0, 140, 0), row(0, 140, 2.5)), shapely.box(-1, -1, 141, 3.5) - holes, headland=0)
+    assert lanes["label"].tolist()[24:] == ["1-2 y", "1-2 z", "1-2 aa", "1-2 ab"]
+
+
 def test_robots_go_round_a_hole(tmp_path):
     rows, parcel = rows_outside(POND), AROUND.difference(POND)
     outline = gpd.GeoDataFrame({"parcel": ["A"]}, geometry=[parcel], crs=rows.crs)

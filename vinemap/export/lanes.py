@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import geopandas as gpd
@@ -251,8 +252,14 @@ def _name_parts(table: list[dict[str, Any]]) -> None:
     for lane in table:
         name = lane["label"]
         if often[name] > 1:
-            lane["label"] = f"{name} {chr(ord('a') + so_far[name])}"
+            lane["label"] = f"{name} {_letters(so_far[name])}"
             so_far[name] += 1
+
+
+def _letters(n: int) -> str:
+    """The nth of a … z, aa, ab …, the first for 0."""
+    before, last = divmod(n, len(ascii_lowercase))
+    return (_letters(before - 1) if before else "") + ascii_lowercase[last]
 
 
 def _describe(
