@@ -13,6 +13,8 @@ import shapely
 from commands import assert_refused, vinemap
 from squares import write_cloud
 
+from vinemap.cli.track import track
+from vinemap.config.settings import OdometryOptions
 from vinemap.simulate.survey import write_survey
 from vinemap.stages import STAGES
 from vinemap.terminal import progress
@@ -158,3 +160,10 @@ def test_programs_are_told_the_stages_in_lines(monkeypatch, capsys):
     with progress("A") as step:
         assert step("DTM", max, 1, 2) == 2
     assert capsys.readouterr().err == f"1/{len(STAGES)} DTM\n"
+
+
+def test_what_a_template_is_a_share_of_is_told_as_in_the_settings():
+    option = next(one for one in track.params if one.name == "template_share")
+    known = OdometryOptions.model_fields["template_share"]
+    assert known.description in option.help.lower()
+    assert option.default == known.default

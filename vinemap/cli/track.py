@@ -31,7 +31,7 @@ METHODS = ("aligned", "quadratic", "centroid", "maximum")
     "--template-share",
     type=SHARE,
     default=0.2,
-    help="Template, of the image's height; 0.2.",
+    help="Width of the template, of the images' shorter side; 0.2 by default.",
 )
 @click.option("--turn", type=click.FloatRange(1, 90), default=9.0, help="Most degrees a frame; 9 by default.")
 @click.option(
