@@ -63,12 +63,33 @@ def test_an_upload_that_pauses_waits_for_a_day(clouds, place):
     assert not found(place)[0].waits
 
 
-def test_a_clock_that_is_ahead_holds_nothing_up(clouds, place):
-    """A file of the future can't be waited for, but may still be unfinished."""
+@pytest.mark.parametrize(("ahead", "waits"), [(1, True), (60, True), (3600, True), (2 * estate.LATE, False)])
+def test_an_upload_to_a_disk_whose_clock_is_ahead(clouds, place, ahead, waits):
+    """All times of its files are ahead, so that they wait until these are past, but for what never would be."""
     path = place / "may.laz"
     put(clouds["laz 1.4"], path)
-    os.utime(path, (NOW + 1e6, NOW + 1e6))
-    assert found(place)[0].config
+    (arrival,) = found(place, now=path.stat().st_mtime - ahead)
+    assert arrival.waits is waits
+    assert bool(arrival.config) is not waits
+
+
+def test_a_time_that_is_hardly_ahead_may_be_of_an_upload(clouds, place):
+    path = place / "may.laz"
+    put(clouds["laz 1.4"], path)
+    os.utime(path, (NOW + 60, NOW + 60))
+    assert found(place)[0].reason == "changed 0 s ago, waits until 300 s"
+    assert found(place, settle=0)[0].config
+
+
+@pytest.mark.parametrize("ahead", [3600, 1e9])
+def test_a_camera_whose_clock_was_ahead_holds_nothing_up(clouds, place, ahead):
+    """A file of the future can't be waited for, but may still be unfinished."""
+    path, part = place / "may.laz", place / "june.laz.part"
+    put(clouds["laz 1.4"], path, part)
+    for file in (path, part):
+        os.utime(file, (NOW + ahead, NOW + ahead))
+    assert found(place)[1].config
     os.truncate(path, 5000)
-    os.utime(path, (NOW + 1e6, NOW + 1e6))
-    assert found(place)[0].waits
+    os.utime(path, (NOW + ahead, NOW + ahead))
+    assert [arrival.waits for arrival in found(place)] == [True, True]
+    assert [arrival.waits for arrival in found(place, now=NOW + 2 * estate.LATE)] == [False, False]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
+from math import inf
 from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import naming, paths
@@ -146,7 +147,7 @@ def _arrival(name: str, group: list[Path], estate: EstateConfig, now: float) -> 
     passed = [f"{path.name} {why}" for path, why in found.unusable.items()]
     passed += [f"{path.name} holds clouds, too: move them up" for path in found.deeper]
     for path in found.partial:
-        age = now - path.stat().st_mtime
+        age = _age(path, now, estate.settle)
         reason = f"{path}: is no whole file: is its upload over?"
         if age < LATE or not found.clouds:
             return Arrival(name, None, reason, waits=age < LATE, passed=tuple(passed))
@@ -179,13 +180,24 @@ def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConf
     used = [p for p in (*clouds, config.boundaries, config.rows, config.vines, own) if p]
     for file in used:
         _check(file)
-    age = now - max(part.stat().st_mtime for p in used if not naming.url_of(p) for part in parts_of(p))
-    if 0 <= age < estate.settle:
+    age = min(_age(part, now, estate.settle) for p in used if not naming.url_of(p) for part in parts_of(p))
+    if age < estate.settle:
         return Arrival(name, None, f"changed {age:.0f} s ago, waits until {estate.settle:.0f} s", waits=True)
     for cloud in clouds:
         if not kind_of(cloud) and (lacks := unfinished(cloud)):
             return Arrival(name, None, f"{cloud}: {lacks}: is its upload over?", waits=age < LATE)
     return Arrival(name, config)
+
+
+def _age(file: Path, now: float, settle: float) -> float:
+    """Seconds since a file changed: 0 if its disk's clock is ahead, infinite if it is so by a day.
+
+    A time that is ahead by more than ``settle`` seconds may have come with the file, as from a camera's clock; then it
+    counts when the file was put where it is.
+    """
+    stat = file.stat()
+    changed = stat.st_mtime if stat.st_mtime < now + settle else stat.st_ctime
+    return max(now - changed, 0) if changed < now + LATE else inf
 
 
 def _found(files: Iterable[Path], folder: Path | None) -> _Found:
