@@ -118,7 +118,10 @@ def _unreadable(path: Path, error: OSError) -> InputError | BusyError:
 
 
 class Recipe(NamedTuple):
-    """All that the product of a parcel depends on."""
+    """All that the product of a parcel depends on, but for PROJ's grids and the libraries that are installed.
+
+    For others of these alone no product is made anew; PDAL's versions count where it is the engine.
+    """
 
     parcel: str
     clouds: tuple[Path, ...]
