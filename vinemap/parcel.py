@@ -61,7 +61,7 @@ def map_parcel(
     Parameters
     ----------
     cloud : Path or sequence of Path
-        LAS, LAZ or COPC files, worked as one, or folders of such.
+        Files or addresses of any format, worked as one, or folders of such.
     folder : Path
         Where the product goes, whole or not at all.
     parcel : str

@@ -1,4 +1,4 @@
-"""LAS, LAZ and COPC files read in chunks into metres of one projected CRS."""
+"""Clouds of all formats read in chunks into metres of one projected CRS, LAS, LAZ and COPC by laspy."""
 
 from __future__ import annotations
 
@@ -69,15 +69,16 @@ def read_cloud(
     collector: Collector | None = None,
     engine: str = "vinemap",
 ) -> Cloud:
-    """Read LAS, LAZ or COPC files in chunks into one metric projected CRS, clipped to a polygon.
+    """Read clouds of any format in chunks into one metric projected CRS, clipped to a polygon.
 
-    Points flagged as withheld and points of ASPRS class 7 or 18 (noise) are left out. Of a COPC file only what lies
-    about the polygon is read.
+    They are LAS, LAZ and COPC, COPC on web servers, and what :mod:`vinemap.cloud.formats` reads: EPT, E57, PLY, PCD,
+    text, surface models. Points flagged as withheld and points of ASPRS class 7 or 18 (noise) are left out. Of COPC,
+    EPT and surface models only what lies about the polygon is read.
 
     Parameters
     ----------
     clouds : Path or sequence of Path
-        The file, or files that are read as one: tiles, flights.
+        The file or address, or several that are read as one: tiles, flights.
     crs : CRS, optional
         CRS of the files' coordinates; needed where they state none, and preferred to what they state.
     boundary : (Geometry, CRS), optional
@@ -122,10 +123,10 @@ def open_cloud(
     around: Boundary | None = None,
     engine: str = "vinemap",
 ) -> Iterator[tuple[Place, Iterator[Floats]]]:
-    """Open LAS, LAZ or COPC files: gives the place of the first in a metric CRS, and chunks of points (n, 3) of all.
+    """Open clouds of any format: gives the place of the first in a metric CRS, and chunks of points (n, 3) of all.
 
-    Of a COPC file only what lies about the polygon ``around`` is read, where that is a small part. Errors are those of
-    :func:`read_cloud`.
+    Of COPC, EPT and surface models only what lies about the polygon ``around`` is read; of COPC on a disk, where that
+    is a small part. Formats and errors are those of :func:`read_cloud`.
     """
     files, remarks = listed(clouds), list[str]()
     with closing(_chunks_of(files, crs, around, remarks, engine)) as chunks:

@@ -44,12 +44,12 @@ def split_cloud(
     crs: CRS | None = None,
     engine: str = "vinemap",
 ) -> list[Piece | InputError]:
-    """Read LAS, LAZ or COPC files once, and give every polygon its points; in several polygons' they go to each.
+    """Read clouds of any format once, and give every polygon its points; in several polygons' they go to each.
 
     Parameters
     ----------
     clouds : Path or sequence of Path
-        The files.
+        The files or addresses, as of :func:`vinemap.cloud.las.read_cloud`.
     boundaries : sequence of (Geometry, CRS)
         Polygons.
     folder : Path

@@ -58,7 +58,7 @@ def scene_of(products: Sequence[Path], cloud: Path | None = None, *, most: int =
     products : sequence of Path
         Their folders or GeoPackages, or a survey's folder: all of its parcels. All must be in one CRS.
     cloud : Path, optional
-        Points of all of them, LAS, LAZ or COPC; by default the products' own classified clouds, where they have them.
+        Points of all of them, in any format; by default the products' own classified clouds, where they have them.
     most : int
         Points that are shown.
 
