@@ -39,6 +39,8 @@ def write(path, keys):
 def test_a_file_of_a_camera(tmp_path):
     camera = load_camera(write(tmp_path / "camera.yaml", GOOD | {"distortion": [-0.1, 0.01, 0, 0, 0]}))
     assert camera.distortion == (-0.1, 0.01, 0, 0, 0)
+    wide = [12.3, -31.5, 0.001, -0.002, 8.9, 12.6, -30.8, 4.1]  # as OpenCV's rational model has them
+    assert load_camera(write(tmp_path / "wide.yaml", GOOD | {"distortion": wide})).distortion == tuple(wide)
     assert camera.axis == (159.5, 119.5)
 
 
@@ -61,7 +63,7 @@ def test_a_file_of_a_camera(tmp_path):
         ({"mask": [[[0, 0], [10, 0]]]}, "mask"),
         ({"mask": [[[0, 0], [400, 0], [0, 90]]]}, "mask reaches beyond the image's 320 × 240 pixels"),
         ({"distortion": [0.1]}, "must be 4, 5 or 8 numbers"),
-        ({"distortion": [50, 0, 0, 0]}, "distortion.0 = 50: input should be less than or equal to 2"),
+        ({"distortion": [500, 0, 0, 0]}, "distortion.0 = 500: input should be less than or equal to 200"),
         ({"hight": 245}, "unknown key hight: did you mean 'height'"),
     ],
 )

@@ -19,7 +19,7 @@ UNSQUARE = 0.02
 """How much the two focal lengths may differ, as a share: templates are turned in pixels."""
 Pixels = Annotated[int, Field(ge=32, le=20_000)]
 Corner = tuple[float, float]
-LensTerm = Annotated[float, Field(ge=-2, le=2)]
+LensTerm = Annotated[float, Field(ge=-200, le=200)]
 
 
 class Camera(Options):
@@ -31,7 +31,9 @@ class Camera(Options):
     fy: float = Field(gt=0, le=1_000_000, description="focal length along the height (pixels)", examples=[299.41])
     cx: float | None = Field(None, ge=0, le=20_000, description="column of the optical axis (pixels); none: the middle")
     cy: float | None = Field(None, ge=0, le=20_000, description="row of the optical axis (pixels); none: the middle")
-    distortion: tuple[LensTerm, ...] = Field((), description="OpenCV's k1, k2, p1, p2, k3 of the lens; none: a pinhole")
+    distortion: tuple[LensTerm, ...] = Field(
+        (), description="OpenCV's k1, k2, p1, p2, k3 (to k6) of the lens; none: a pinhole"
+    )
     above_ground_mm: float = Field(
         ge=10, le=20_000, description="height of the lens above the ground (mm)", examples=[245]
     )
