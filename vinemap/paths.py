@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
+from uuid import uuid4
 
 from vinemap.naming import plain, safe, url_of
 
@@ -279,9 +280,9 @@ def tile(folder: Path, column: int, row: int) -> Path:
     return folder / f"{column}_{row}.xyz"
 
 
-def geopackage_draft(path: Path) -> Path:
-    """Where a GeoPackage is written before it takes its place."""
-    return path.with_name(f".{path.name}.part.gpkg")
+def draft(path: Path, suffix: str = "") -> Path:
+    """Where a file or folder is made before it takes its place, beside it: another name each time."""
+    return path.with_name(f".{path.name}.{uuid4().hex[:8]}.part{suffix}")
 
 
 def tiles(folder: Path) -> Path:
@@ -299,9 +300,9 @@ def lock(folder: Path) -> Path:
     return folder / ".lock"
 
 
-def parcel_lock(folder: Path) -> Path:
-    """Lock of a parcel's product, beside its folder."""
-    return folder.with_name(f".{folder.name}.lock")
+def lock_beside(path: Path) -> Path:
+    """Lock of a product's folder or a file, beside it."""
+    return path.with_name(f".{path.name}.lock")
 
 
 def survey_record(folder: Path) -> Path:

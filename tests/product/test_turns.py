@@ -4,16 +4,21 @@ import errno
 import os
 import subprocess
 import sys
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from drafts import fill, names, publish
+from pyproj import CRS
 from systems import POSIX
 
 from vinemap.errors import BusyError, OutputError
-from vinemap.product import store
+from vinemap.odometry import drive
+from vinemap.product import geopackage, store
+from vinemap.product.register import file
 
 
 @pytest.fixture
@@ -64,6 +69,50 @@ def test_never_two_at_once(tmp_path):
     assert len(most) == 20
     assert max(most) == 1
     assert names(tmp_path) == ["F"]
+
+
+def test_a_register_that_two_make_at_once_is_one(tmp_path, monkeypatch):
+    path, begun, write = tmp_path / "register.gpkg", threading.Event(), file.write_geopackage
+
+    def slow(*given, **options):
+        begun.set()
+        write(*given, **options)
+        time.sleep(0.2)
+
+    monkeypatch.setattr(file, "write_geopackage", slow)
+    with ThreadPoolExecutor(1) as threads:
+        first = threads.submit(file.make_register, path, CRS(32632))
+        assert begun.wait(5)
+        file.make_register(path, CRS(32633))
+        first.result()
+    assert file.read_register(path).crs.to_epsg() == 32632
+    assert names(tmp_path) == ["register.gpkg"]
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "write"),
+    [
+        (geopackage.pyogrio, "write_dataframe", lambda path: geopackage.write_layer(None, path, layer="rows")),
+        (drive, "write_geopackage", lambda path: drive._write({}, path)),
+    ],
+)
+def test_who_comes_second_leaves_the_first_its_geopackage(tmp_path, monkeypatch, module, name, write):
+    """The second comes and goes while the first is at work."""
+    path, left = tmp_path / "a.gpkg", ["second", "first"]
+
+    def work(layers, draft, **options):
+        who = left.pop()
+        draft.write_text(who)
+        if left:
+            write(path)
+            assert path.read_text() == "second, whole"
+        with draft.open("a") as stream:
+            stream.write(", whole")
+
+    monkeypatch.setattr(module, name, work)
+    write(path)
+    assert path.read_text() == "first, whole"
+    assert names(tmp_path) == ["a.gpkg"]
 
 
 def test_a_lock_is_removed_while_it_is_held(tmp_path, monkeypatch):

@@ -265,9 +265,8 @@ def _check_out(out: Path, rows: Path | None) -> None:
 
 def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:
     out = out.resolve()
-    draft = paths.geopackage_draft(out)
+    draft = paths.draft(out, ".gpkg")
     try:
-        draft.unlink(missing_ok=True)
         write_geopackage(layers, draft, contract=TRACK_LAYERS)
         draft.replace(out)
     except OSError as error:

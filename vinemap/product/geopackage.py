@@ -108,7 +108,7 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     OutputError
         If it can't be written.
     """
-    draft = paths.geopackage_draft(path)
+    draft = paths.draft(path, ".gpkg")
     try:
         with _gdal(**WITHOUT_LOCKS):
             pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})

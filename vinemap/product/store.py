@@ -10,7 +10,6 @@ import re
 import shutil
 import sys
 import tempfile
-import uuid
 import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -60,7 +59,7 @@ def workshop(folder: Path) -> Iterator[Path]:
     made = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _held(paths.lock(folder), f"{folder}: another job is at work here: wait until it is done"):
+        with held(paths.lock(folder), f"{folder}: another job is at work here: wait until it is done"):
             _sweep(folder)
             try:
                 with tempfile.TemporaryDirectory(prefix=paths.PIECES, dir=folder, ignore_cleanup_errors=True) as inner:
@@ -102,10 +101,10 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         raise OutputError(f"{target}: is a link to {place}: put a folder in its place")
     _check_path(place)
     made = [folder for folder in place.parents if not folder.exists()]
-    draft = (drafts or place.parent) / f".{place.name}.{uuid.uuid4().hex[:8]}.part"
+    draft = paths.draft((drafts or place.parent) / place.name)
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        with _held(paths.parcel_lock(place), f"{target}: another run is at work here", patience=PATIENCE):
+        with held(paths.lock_beside(place), f"{target}: another run is at work here", patience=PATIENCE):
             if place.exists() and not place.is_dir():
                 raise NotADirectoryError(20, "is a file")
             if not drafts:
@@ -141,7 +140,7 @@ def write_whole(path: Path, text: str) -> None:
     OSError
         If it can't be written.
     """
-    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    draft = paths.draft(path)
     try:
         draft.write_text(text, encoding="utf-8")
         draft.replace(path)
@@ -158,8 +157,27 @@ def unwritable(place: Path, error: OSError) -> OutputError:
 
 
 @contextmanager
-def _held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
-    """Hold a lock, which the system lets go of if this process dies; BusyError says the reason if another has it."""
+def held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
+    """Hold a lock, which the system lets go of if this process dies.
+
+    Parameters
+    ----------
+    lock : Path
+        Its file, which goes when it is let go of.
+    reason : str
+        What BusyError says if another has it.
+    patience : float
+        Seconds for which another may have it.
+
+    Raises
+    ------
+    BusyError
+        If another keeps it.
+    OutputError
+        If the disk has no locks.
+    OSError
+        If its file can't be written.
+    """
     holder = FileLock(lock)
     try:
         with warnings.catch_warnings():
@@ -189,10 +207,10 @@ def _sweep(folder: Path) -> None:
         if path.name.startswith(paths.PIECES):
             shutil.rmtree(path, ignore_errors=True)
         elif part := PART.fullmatch(path.name):
-            with suppress(VinemapError, OSError), _held(paths.parcel_lock(folder / part[1]), "held"):
+            with suppress(VinemapError, OSError), held(paths.lock_beside(folder / part[1]), "held"):
                 _remove(path)
         elif path.name.startswith(".") and path.suffix == ".lock" and path != paths.lock(folder):
-            with suppress(VinemapError, OSError), _held(path, "held"):
+            with suppress(VinemapError, OSError), held(path, "held"):
                 pass
 
 
@@ -271,7 +289,7 @@ def _exchange(draft: Path, target: Path) -> None:
             names = os.fsencode(draft), os.fsencode(target)
             if ctypes.CDLL(None).renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE) == 0:
                 return
-    old = draft.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    old = paths.draft(draft.with_name(target.name))
     target.rename(old)
     try:
         draft.rename(target)

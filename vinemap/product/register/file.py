@@ -26,6 +26,7 @@ from vinemap.geo.crs import project
 from vinemap.geo.lines import LAST_NUMBER, ROW_LAYER, as_rows
 from vinemap.product.geopackage import write_geopackage
 from vinemap.product.layers import REAL, TEXT, WHOLE, Layer
+from vinemap.product.store import held
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -138,22 +139,25 @@ def update_register(path: Path, change: Callable[[Register], Update]) -> None:
 
 
 def make_register(path: Path, crs: CRS) -> None:
-    """Make a register without rows, unless there is one.
+    """Make a register without rows, unless there is one, or another run makes it meanwhile.
 
     Raises
     ------
+    BusyError
+        If another run doesn't come to an end with it.
     OutputError
         If it can't be written.
     """
     if path.exists():
         return
     tables = {name: _empty(layer, crs) for name, layer in REGISTER.items()}
-    draft = paths.geopackage_draft(path)
+    draft = paths.draft(path, ".gpkg")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft.unlink(missing_ok=True)
-        write_geopackage(tables, draft, contract=REGISTER)
-        draft.rename(path)
+        with held(paths.lock_beside(path), f"{path}: another run is at work here", patience=PATIENCE):
+            if not path.exists():
+                write_geopackage(tables, draft, contract=REGISTER)
+                draft.rename(path)
     except OSError as error:
         raise OutputError(f"{path}: can't be written ({error.strerror or error}): choose another file") from error
     finally:
