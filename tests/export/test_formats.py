@@ -90,9 +90,12 @@ def test_the_same_again_and_what_others_put_there_stays(tmp_path, product, expor
     list(export_products([product], tmp_path, formats=FORMATS, lines="both"))
     assert tree(tmp_path / NAME) == tree(exported)
     folder = tmp_path / NAME / "geojson"
-    (folder / "notes.txt").write_text("mine")
-    list(export_products([product], tmp_path, formats=["geojson"], lines="rows"))
-    assert (folder / "notes.txt").read_text() == "mine"
+    mine = [folder / "notes.txt", folder.parent / "isoxml" / "TASKDATA" / "TLG00001.XML"]
+    mine.append(folder.parent / "agopengps" / NAME / "Sections.txt")
+    for path in mine:
+        path.write_text("mine")
+    list(export_products([product], tmp_path, formats=["geojson", "isoxml", "agopengps"], lines="rows"))
+    assert [path.read_text() for path in mine] == ["mine"] * 3
     assert not (folder / f"{NAME}_lanes.geojson").exists()
     assert (folder / f"{NAME}_rows.geojson").exists()
     assert not list(tmp_path.rglob(".*"))

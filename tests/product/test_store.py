@@ -116,6 +116,31 @@ def test_what_others_put_beside_a_product_stays(tmp_path, within):
     assert names(tmp_path) == ["F"]
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_what_others_put_into_a_product_s_folders_stays(tmp_path, recorded):
+    """Though the record that tells whose a file is may be lost."""
+    target, files = tmp_path / "F", ("a/b/old", "a/b/both", "a/both", "c/old")
+    for text, written in (("old", files), ("new", ("a/b/both", "a/both", "d/new"))):
+        with store.product(target, within=tmp_path) as draft:
+            for name in written:
+                (draft / name).parent.mkdir(parents=True, exist_ok=True)
+            fill(draft, text, files=written)
+        if text == "old":
+            for name in ("a/mine", "a/b/mine", "a/b/old-wal", "a/e/mine", "d/mine"):
+                (target / name).parent.mkdir(exist_ok=True)
+                (target / name).write_text("mine")
+            (target / "a" / "empty").mkdir()
+            if not recorded:
+                (target / "run.json").unlink()
+    found = {path.relative_to(target).as_posix(): path.read_text() for path in target.rglob("*") if path.is_file()}
+    mine, ours = ["a/mine", "a/b/mine", "a/e/mine", "d/mine"], ["a/b/both", "a/both", "d/new"]
+    lost = [] if recorded else ["a/b/old", "a/b/old-wal", "c/old"]
+    assert sorted(found) == sorted([*mine, *ours, *lost, "run.json"])
+    assert [found[name] for name in mine + ours] == ["mine"] * 4 + ["new"] * 3
+    assert (target / "a" / "empty").is_dir()
+    assert (target / "c").exists() == (not recorded)
+
+
 def test_what_others_keep_is_copied_where_it_cannot_be_linked(tmp_path, monkeypatch):
     publish(tmp_path / "F", "old")
     (tmp_path / "F" / "note.txt").write_text("mine")

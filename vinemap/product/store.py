@@ -222,11 +222,15 @@ def _remove_parts(place: Path) -> None:
 
 def _remove(path: Path) -> None:
     """Remove a folder or a file, as far as that can be done."""
-    if path.is_dir() and not path.is_symlink():
+    if _is_folder(path):
         shutil.rmtree(path, ignore_errors=True)
     else:
         with suppress(OSError):
             path.unlink()
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _remove_empty(folders: Sequence[Path]) -> None:
@@ -261,15 +265,32 @@ def _record(folder: Path) -> dict[str, object]:
     return record if isinstance(record, dict) else {}
 
 
-def _keep_others(target: Path, draft: Path) -> None:
-    """Take a folder's files over that aren't of the product in it, nor made beside them by QGIS."""
+def _files(draft: Path) -> list[str]:
+    return [path.relative_to(draft).as_posix() for path in draft.rglob("*") if not _is_folder(path)]
+
+
+def _recorded(target: Path) -> list[str]:
+    """Files of a product, as its record has them."""
     files = _record(target).get("files")
-    ours = {*files, paths.RUN} if isinstance(files, (list, dict)) else {paths.RUN}
-    for path in target.iterdir():
-        kept = draft / path.name
-        if path.name in ours or SIDE.sub("", path.name) in ours or kept.exists():
-            continue
-        if path.is_dir() and not path.is_symlink():
+    return [*map(str, files)] if isinstance(files, (list, dict)) else []
+
+
+def _others(folder: Path, ours: set[str], within: str = "") -> Iterator[str]:
+    """Files and folders in a product's folder that aren't of ours, nor made beside them by QGIS."""
+    for path in folder.iterdir():
+        name = f"{within}{path.name}"
+        if _is_folder(path) and any(one.startswith(f"{name}/") for one in ours):
+            yield from _others(path, ours, f"{name}/")
+        elif _is_folder(path) or not {name, SIDE.sub("", name)} & ours:
+            yield name
+
+
+def _keep_others(target: Path, draft: Path) -> None:
+    """Take over into a draft what in a folder isn't of the product in it."""
+    for name in _others(target, {paths.RUN, *_recorded(target), *_files(draft)}):
+        path, kept = target / name, draft / name
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        if _is_folder(path):
             shutil.copytree(path, kept, symlinks=True, copy_function=_link)
         else:
             _link(path, kept)
