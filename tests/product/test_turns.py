@@ -15,6 +15,7 @@ from drafts import fill, names, publish
 from pyproj import CRS
 from systems import POSIX
 
+from vinemap.compute import locks
 from vinemap.errors import BusyError, OutputError
 from vinemap.odometry import drive
 from vinemap.product import geopackage, store
@@ -119,12 +120,12 @@ def test_a_lock_is_removed_while_it_is_held(tmp_path, monkeypatch):
     """Later it could be another's."""
     held = []
 
-    class Watched(store.FileLock):
+    class Watched(locks.FileLock):
         def release(self, *words, **options):
             held.append(Path(self.lock_file).exists())
             super().release(*words, **options)
 
-    monkeypatch.setattr(store, "FileLock", Watched)
+    monkeypatch.setattr(locks, "FileLock", Watched)
     publish(tmp_path / "F")
     assert set(held) == {False}
 

@@ -10,21 +10,18 @@ import re
 import shutil
 import sys
 import tempfile
-import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from filelock import FileLock, Timeout
-
 from vinemap import paths
-from vinemap.errors import BusyError, OutputError, VinemapError
+from vinemap.compute.locks import held
+from vinemap.errors import OutputError, VinemapError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
-LOCKLESS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL}
 BUSY = {5, 32}
 """What Windows says where another program has a file open."""
 LONGEST_PATH = 259
@@ -154,51 +151,6 @@ def unwritable(place: Path, error: OSError) -> OutputError:
     if getattr(error, "winerror", None) in BUSY:
         advice = "close what has its files open, as QGIS may, or choose another folder"
     return OutputError(f"{place}: can't be written ({error.strerror or error}): {advice}")
-
-
-@contextmanager
-def held(lock: Path, reason: str, *, patience: float = 0.0) -> Iterator[None]:
-    """Hold a lock, which the system lets go of if this process dies.
-
-    Parameters
-    ----------
-    lock : Path
-        Its file, which goes when it is let go of.
-    reason : str
-        What BusyError says if another has it.
-    patience : float
-        Seconds for which another may have it.
-
-    Raises
-    ------
-    BusyError
-        If another keeps it.
-    OutputError
-        If the disk has no locks.
-    OSError
-        If its file can't be written.
-    """
-    holder = FileLock(lock)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that the system's locks are only files
-            holder.acquire(timeout=patience)
-    except Timeout as error:
-        raise BusyError(reason) from error
-    except OSError as error:
-        if error.errno not in LOCKLESS:
-            raise
-        lock.unlink(missing_ok=True)
-        raise OutputError(
-            f"{lock.parent}: its disk has no locks ({error.strerror}): choose a folder on another disk"
-        ) from error
-    try:
-        yield
-    finally:
-        # Who waits for it finds out that it is no longer the file of that name, and makes another.
-        with suppress(OSError):
-            lock.unlink()
-        holder.release()
 
 
 def _sweep(folder: Path) -> None:

@@ -21,12 +21,12 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from vinemap import paths
+from vinemap.compute.locks import held
 from vinemap.errors import BusyError, InputError, OutputError, reason_of
 from vinemap.geo.crs import project
 from vinemap.geo.lines import LAST_NUMBER, ROW_LAYER, as_rows
 from vinemap.product.geopackage import write_geopackage
 from vinemap.product.layers import REAL, TEXT, WHOLE, Layer
-from vinemap.product.store import held
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
