@@ -1,12 +1,15 @@
-"""Where products can be put: folders that can't be written, links, long names."""
+"""Where products can be put: folders that can't be written, links, disks of their own, long names."""
 
 import errno
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from drafts import fill, names, publish
-from systems import POSIX
+from systems import LINUX, POSIX
 
 from vinemap import paths
 from vinemap.config.names import check_name
@@ -107,6 +110,117 @@ def test_a_survey_s_own_folder_may_be_a_link(tmp_path):
     with store.workshop(tmp_path / "products") as aside:
         publish(tmp_path / "products" / "F", drafts=aside, within=tmp_path / "products")
     assert names(tmp_path / "real") == ["F"]
+
+
+@pytest.fixture
+def mounted(tmp_path, monkeypatch):
+    """A folder that can't be moved, and into which and out of which nothing can be."""
+    target, rename = tmp_path / "out", Path.rename
+    target.mkdir()
+
+    def renamed(path, to):
+        if (target in path.parents) != (target in Path(to).parents):
+            raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+        rename(path, to)
+
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == target)
+    monkeypatch.setattr(Path, "rename", renamed)
+    monkeypatch.setattr(Path, "replace", renamed)
+    return target
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_a_disk_of_its_own(mounted, within):
+    options = {"within": mounted.parent, "drafts": mounted.parent} if within else {}
+    (mounted / "note.txt").write_text("mine")
+    (mounted / ".product.01234567.part").mkdir()
+    with store.product(mounted, **options) as draft:
+        assert names(mounted.parent) == ["out"]
+        (draft / "a").mkdir()
+        fill(draft, "old", files=("F_old.tif", "F.gpkg", "a/old", "a/both"))
+    for name in ("F.gpkg-wal", "a/mine"):
+        (mounted / name).write_text("mine")
+    with store.product(mounted, **options) as draft:
+        (draft / "a").mkdir()
+        fill(draft, files=("F.gpkg", "a/both"))
+    assert names(mounted) == ["F.gpkg", "a", "note.txt", "run.json"]
+    assert names(mounted / "a") == ["both", "mine"]
+    assert [(mounted / name).read_text() for name in ("F.gpkg", "a/both", "note.txt")] == ["new", "new", "mine"]
+    assert names(mounted.parent) == ["out"]
+
+
+@pytest.mark.parametrize("parcel", ["F", "G"])
+def test_all_is_as_before_on_a_disk_of_its_own_if_one_file_cannot_be_put(mounted, parcel, monkeypatch):
+    with store.product(mounted) as draft:
+        fill(draft, "old", parcel=parcel)
+    before = {path: path.read_text() for path in mounted.iterdir()}
+    rename = Path.rename
+
+    def stubborn(path, to):
+        if path.name == "F_dtm.tif" and path.read_text() == "new":
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+        rename(path, to)
+
+    monkeypatch.setattr(Path, "rename", stubborn)
+    with pytest.raises(OutputError, match="Permission denied"):
+        publish(mounted)
+    assert {path: path.read_text() for path in mounted.iterdir()} == before
+
+
+@pytest.mark.parametrize("parcel", ["F", "G"])
+def test_a_disk_of_its_own_that_the_system_does_not_tell_loses_nothing(mounted, parcel, monkeypatch):
+    with store.product(mounted) as draft:
+        fill(draft, "old", parcel=parcel)
+    monkeypatch.setattr(os.path, "ismount", lambda path: False)
+    monkeypatch.setattr(store, "_exchange", lambda draft, target: draft.rename(target / "a"))
+    with pytest.raises(OutputError, match=r"out: can't be written"):
+        publish(mounted)
+    assert json.loads((mounted / "run.json").read_text())["parcel"] == parcel
+    assert names(mounted) == ["F.gpkg", "F_dtm.tif", "run.json"]
+
+
+def test_a_folder_that_cannot_be_moved_though_its_files_can(tmp_path, monkeypatch):
+    def fixed(draft, target):
+        raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+
+    monkeypatch.setattr(store, "_exchange", fixed)
+    publish(tmp_path / "F", "old")
+    (tmp_path / "F" / "note.txt").write_text("mine")
+    publish(tmp_path / "F")
+    assert names(tmp_path / "F") == ["F.gpkg", "F_dtm.tif", "note.txt", "run.json"]
+    assert [(tmp_path / "F" / name).read_text() for name in ("F.gpkg", "note.txt")] == ["new", "mine"]
+    assert names(tmp_path) == ["F"]
+
+
+WORK = """
+import json
+from pathlib import Path
+from drafts import fill, names
+from vinemap.product import store
+out = Path("my out")
+for parcel in "FFG":
+    with store.product(out) as draft:
+        fill(draft, "new", parcel=parcel, files=(f"{parcel}.gpkg",))
+print(json.dumps([names(Path(".")), names(out), json.loads((out / "run.json").read_text())["parcel"]]))
+"""
+MOUNTS = {"another disk": "mount -t tmpfs none 'my out'", "the same": "mount --bind other 'my out'"}
+
+
+@LINUX
+@pytest.mark.parametrize("disk", MOUNTS)
+def test_what_is_mounted_in_truth(tmp_path, disk):
+    """As a container's volumes are."""
+    alone = ["unshare", "--user", "--map-root-user", "--mount"]
+    try:
+        subprocess.run([*alone, "true"], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("needs leave to mount")
+    command = [*alone, "sh", "-ec", f'mkdir "my out" other; {MOUNTS[disk]}; exec "$0" -c "$1"', sys.executable, WORK]
+    here = Path(__file__)
+    settings = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (here.parents[1], here.parents[2])))}
+    done = subprocess.run(command, cwd=tmp_path, env=settings, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert json.loads(done.stdout) == [["my out", "other"], ["F.gpkg", "G.gpkg", "run.json"], "G"]
 
 
 @pytest.mark.parametrize("letter", ["F", "é", "葡", "🍇"])

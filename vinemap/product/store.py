@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
+FIXED = {errno.EXDEV, errno.EBUSY}
+"""What a system says of a folder that can't be moved, though its files can: one of an image's lower layers, say."""
 BUSY = {5, 32}
 """What Windows says where another program has a file open."""
 LONGEST_PATH = 259
@@ -75,7 +77,8 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
 
     An earlier product is replaced whole, at one stroke where the system can do that (on Linux), and other files beside
     it stay. In a folder that holds something else and isn't one of a survey's, the product's files replace those of
-    the same name. The folder is made beside the target, or among ``drafts``, on the same disk.
+    the same name. The folder is made beside the target, or among ``drafts``, on the same disk; in the target if that is
+    a disk of its own, whose files are replaced one by one.
 
     Parameters
     ----------
@@ -98,14 +101,16 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         raise OutputError(f"{target}: is a link to {place}: put a folder in its place")
     _check_path(place)
     made = [folder for folder in place.parents if not folder.exists()]
-    draft = paths.draft((drafts or place.parent) / place.name)
+    seat = _seat(place)
+    drafts = drafts if seat == place else None
+    draft = paths.draft((drafts or seat.parent) / seat.name)
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        with held(paths.lock_beside(place), f"{target}: another run is at work here", patience=PATIENCE):
+        with held(paths.lock_beside(seat), f"{target}: another run is at work here", patience=PATIENCE):
             if place.exists() and not place.is_dir():
                 raise NotADirectoryError(20, "is a file")
             if not drafts:
-                _remove_parts(place)
+                _remove_parts(seat)
             draft.mkdir()
             try:
                 yield draft
@@ -116,6 +121,23 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         raise unwritable(target, error) from error
     finally:
         _remove_empty(made)
+
+
+def _seat(place: Path) -> Path:
+    """What the lock and the drafts of a product lie beside: its folder, or a name in it if that can't be moved."""
+    return place / "product" if _is_mounted(place) else place
+
+
+def _is_mounted(place: Path) -> bool:
+    """Whether a folder is a disk of its own, or put in its place from elsewhere on the same."""
+    if os.path.ismount(place):
+        return True
+    name = re.sub(rb"[ \t\n\\]", lambda one: b"\\%03o" % ord(one[0]), os.fsencode(place))
+    try:
+        mounts = Path("/proc/self/mountinfo").read_bytes().split(b"\n")
+    except OSError:  # of Linux alone
+        return False
+    return any(line.split()[4:5] == [name] for line in mounts)
 
 
 def _check_path(place: Path) -> None:
@@ -194,13 +216,21 @@ def _remove_empty(folders: Sequence[Path]) -> None:
 def _publish(draft: Path, target: Path, *, replace: bool) -> None:
     if not target.exists():
         draft.rename(target)
-    elif replace or _is_earlier(target, draft):
-        _keep_others(target, draft)
-        _exchange(draft, target)
-    else:
-        paths.run_record(target).unlink(missing_ok=True)
-        for path in sorted(draft.iterdir(), key=lambda p: p.name == paths.RUN):
-            path.replace(target / path.name)
+        return
+    whole = replace or _is_earlier(target, draft)
+    new = [path.relative_to(draft).as_posix() for path in draft.rglob("*") if not _is_folder(path)]
+    ours, others = _parted(target, {paths.RUN, *new, *(_recorded(target) if whole else ())})
+    if whole and draft.parent != target:
+        for name in others:
+            _keep(target / name, draft / name)
+        try:
+            _exchange(draft, target)
+        except OSError as error:
+            if error.errno not in FIXED:
+                raise
+        else:
+            return
+    _replace(target, draft, ours, new)
 
 
 def _is_earlier(target: Path, draft: Path) -> bool:
@@ -217,35 +247,34 @@ def _record(folder: Path) -> dict[str, object]:
     return record if isinstance(record, dict) else {}
 
 
-def _files(draft: Path) -> list[str]:
-    return [path.relative_to(draft).as_posix() for path in draft.rglob("*") if not _is_folder(path)]
-
-
 def _recorded(target: Path) -> list[str]:
     """Files of a product, as its record has them."""
     files = _record(target).get("files")
     return [*map(str, files)] if isinstance(files, (list, dict)) else []
 
 
-def _others(folder: Path, ours: set[str], within: str = "") -> Iterator[str]:
-    """Files and folders in a product's folder that aren't of ours, nor made beside them by QGIS."""
+def _parted(folder: Path, files: set[str], within: str = "") -> tuple[list[str], list[str]]:
+    """What there is in a folder of a product's files, and of what QGIS made beside them; and what else is there."""
+    ours: list[str] = []
+    others: list[str] = []
     for path in folder.iterdir():
         name = f"{within}{path.name}"
-        if _is_folder(path) and any(one.startswith(f"{name}/") for one in ours):
-            yield from _others(path, ours, f"{name}/")
-        elif _is_folder(path) or not {name, SIDE.sub("", name)} & ours:
-            yield name
-
-
-def _keep_others(target: Path, draft: Path) -> None:
-    """Take over into a draft what in a folder isn't of the product in it."""
-    for name in _others(target, {paths.RUN, *_recorded(target), *_files(draft)}):
-        path, kept = target / name, draft / name
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        if _is_folder(path):
-            shutil.copytree(path, kept, symlinks=True, copy_function=_link)
+        if _is_folder(path) and any(file.startswith(f"{name}/") for file in files):
+            inner = _parted(path, files, f"{name}/")
+            ours, others = ours + inner[0], others + inner[1]
+        elif _is_folder(path) or not {name, SIDE.sub("", name)} & files:
+            others.append(name)
         else:
-            _link(path, kept)
+            ours.append(name)
+    return ours, others
+
+
+def _keep(path: Path, kept: Path) -> None:
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    if _is_folder(path):
+        shutil.copytree(path, kept, symlinks=True, copy_function=_link)
+    else:
+        _link(path, kept)
 
 
 def _link(path: str | Path, kept: str | Path) -> None:
@@ -253,6 +282,23 @@ def _link(path: str | Path, kept: str | Path) -> None:
         os.link(path, kept, follow_symlinks=False)
     except (OSError, NotImplementedError):  # a disk or a system without them
         shutil.copy2(path, kept, follow_symlinks=False)
+
+
+def _replace(target: Path, draft: Path, ours: Sequence[str], new: Sequence[str]) -> None:
+    """Put files into a folder one by one, the record last, in place of those of ours; all of them, or none."""
+    old = draft / ".old"
+    moves = [(target / name, old / name) for name in sorted(ours, key=lambda name: name != paths.RUN)]
+    moves += [(draft / name, target / name) for name in sorted(new, key=lambda name: name == paths.RUN)]
+    done: list[tuple[Path, Path]] = []
+    try:
+        for path, place in moves:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            path.rename(place)
+            done.append((path, place))
+    except BaseException:
+        for path, place in reversed(done):
+            place.rename(path)
+        raise
 
 
 def _exchange(draft: Path, target: Path) -> None:
