@@ -4,6 +4,7 @@ import base64
 import json
 import shutil
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import geopandas as gpd
@@ -13,7 +14,9 @@ import shapely
 from products import place_product
 
 from vinemap import paths
+from vinemap.product import store
 from vinemap.product.pages import changes
+from vinemap.product.pages import survey as surveys
 from vinemap.product.pages.page import LEVEL, page, repacked, unpacked
 from vinemap.product.pages.survey import write_index
 from vinemap.product.recipe import product_in
@@ -165,6 +168,46 @@ def test_a_parcels_page_shows_its_earlier_flights(flights, tmp_path):
     assert write_index(folder, "september")
     assert unpacked(path.read_text(encoding="utf-8"), "history") is None
     assert product_in(folder / "A")
+
+
+@pytest.fixture
+def reported(estate):
+    """The last flight of A with a page that shows no other."""
+    folder = estate / "fall" / "A"
+    report, run = paths.report(folder, "A"), paths.run_record(folder)
+    report.write_text(page("index", "t", {}, packed={"history": b"null"}), encoding="utf-8")
+    record = json.loads(run.read_text())
+    run.write_text(json.dumps(record | {"files": record["files"] | {report.name: report.stat().st_size}}))
+    return folder
+
+
+def shown(folder):
+    return unpacked(paths.report(folder, "A").read_text(encoding="utf-8"), "history")
+
+
+def test_a_page_at_which_another_run_works_is_told_another_night(reported):
+    with ThreadPoolExecutor(1) as threads, store.product(reported, within=reported.parent) as draft:
+        shutil.copytree(reported, draft, dirs_exist_ok=True)
+        threads.submit(write_index, reported.parent, "fall").result()
+        assert shown(reported) is None
+    write_index(reported.parent, "fall")
+    assert len(shown(reported)["dates"]) == 3
+
+
+def test_a_product_that_another_run_has_put_there_meanwhile_stays_as_it_is(reported, monkeypatch):
+    run = paths.run_record(reported)
+    new = run.read_text().replace('"fall A"', '"new"')
+    tell = surveys.tell_parcel
+
+    def late(*given):
+        run.write_text(new)
+        return tell(*given)
+
+    paths.index(reported.parent).unlink()
+    monkeypatch.setattr(surveys, "tell_parcel", late)
+    write_index(reported.parent, "fall")
+    assert run.read_text() == new
+    assert shown(reported) is None
 
 
 def test_what_was_not_seen_of_a_row_is_told_beside_its_numbers(estate):

@@ -20,6 +20,7 @@ from vinemap.errors import OutputError, VinemapError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from contextlib import AbstractContextManager
 
 FULL = {errno.ENOSPC, errno.EDQUOT}
 FIXED = {errno.EXDEV, errno.EBUSY}
@@ -106,7 +107,7 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
     draft = paths.draft((drafts or seat.parent) / seat.name)
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        with held(paths.lock_beside(seat), f"{target}: another run is at work here", patience=PATIENCE):
+        with alone(target, patience=PATIENCE):
             if place.exists() and not place.is_dir():
                 raise NotADirectoryError(20, "is a file")
             if not drafts:
@@ -121,6 +122,12 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
         raise unwritable(target, error) from error
     finally:
         _remove_empty(made)
+
+
+def alone(target: Path, *, patience: float = 0.0) -> AbstractContextManager[None]:
+    """Hold a product against other runs, as :func:`product` does; raises as :func:`vinemap.compute.locks.held`."""
+    seat = _seat(Path(os.path.realpath(target)))
+    return held(paths.lock_beside(seat), f"{target}: another run is at work here", patience=patience)
 
 
 def _seat(place: Path) -> Path:

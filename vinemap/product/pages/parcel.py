@@ -13,7 +13,8 @@ from vinemap import paths
 from vinemap.errors import own_fault
 from vinemap.geo.raster import block_sum
 from vinemap.product.pages.page import as_json, mean_of, page, polylines, repacked, rings, whole_numbers
-from vinemap.product.store import write_whole
+from vinemap.product.seasons.products import read_product
+from vinemap.product.store import alone, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
     from vinemap.geo.raster import Raster
+    from vinemap.product.seasons.products import Product
 
 TALLEST = 3.0
 """Height above ground, in metres, from which on the canopy's picture is darkest."""
@@ -223,18 +225,25 @@ def write_page(
     return []
 
 
-def tell_seasons(folder: Path, parcel: str, seasons: Mapping[str, Any] | None, key: str) -> None:
+def tell_seasons(product: Product, seasons: Mapping[str, Any] | None, key: str) -> None:
     """Have a product's page show what :func:`vinemap.product.seasons.history.history` gives, or nothing any more.
 
-    The product's record tells the page's new size, and the key of what it shows.
+    The product's record tells the page's new size, and the key of what it shows. What another run has put in the
+    product's place stays as it is.
 
     Raises
     ------
+    BusyError
+        If another run is at work on the product.
     OSError
         If it can't be read or written.
     """
-    path = paths.report(folder, parcel)
-    record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-    write_whole(path, repacked(path.read_text(encoding="utf-8"), HISTORY, as_json(seasons).encode()))
-    record["files"][path.name] = path.stat().st_size
-    write_whole(paths.run_record(folder), json.dumps(record | {"seasons": key}, indent=2, ensure_ascii=False))
+    path, run = paths.report(product.folder, product.parcel), paths.run_record(product.folder)
+    with alone(product.folder):
+        there = read_product(product.folder)
+        if not there or there.key != product.key:
+            return
+        record = json.loads(run.read_text(encoding="utf-8"))
+        write_whole(path, repacked(path.read_text(encoding="utf-8"), HISTORY, as_json(seasons).encode()))
+        record["files"][path.name] = path.stat().st_size
+        write_whole(run, json.dumps(record | {"seasons": key}, indent=2, ensure_ascii=False))

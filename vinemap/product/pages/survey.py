@@ -14,6 +14,7 @@ from pyproj import CRS
 
 from vinemap import __version__, paths
 from vinemap.compute.threads import in_threads
+from vinemap.errors import VinemapError
 from vinemap.geo.crs import WGS84
 from vinemap.product.pages.changes import TOLERANCE, outline_of, tell_parcel
 from vinemap.product.pages.page import as_json, page, page_hash, rings, unpacked
@@ -73,8 +74,9 @@ def write_index(folder: Path, survey: str) -> bool:
         write_whole(target, survey_page(survey, known, products, told, key=key))
 
     def tell(name: str) -> None:
-        with suppress(OSError, ValueError, KeyError, TypeError):  # it is no more, or isn't ours to change
-            tell_seasons(products[name].folder, name, told[name].get("history"), wanted[name])
+        # It is no more, isn't ours to change, or another run is at work on it: then it is told another night.
+        with suppress(VinemapError, OSError, ValueError, KeyError, TypeError):
+            tell_seasons(products[name], told[name].get("history"), wanted[name])
 
     in_threads(tell, untold)
     return not fresh
