@@ -20,6 +20,7 @@ from vinemap.compute import machine
 from vinemap.config.names import check_parcel
 from vinemap.geo.main import check_near
 from vinemap.product import store
+from vinemap.product.qgis.changed import changed
 from vinemap.product.recipe import Recipe, recipe_of
 from vinemap.stages import call
 
@@ -139,10 +140,12 @@ def follow(
         if origin:
             check_near(origin, points.extent[0], points.crs)
         from vinemap.making import make_product
+        from vinemap.product.notices import change_notices
         from vinemap.product.record import Summary
 
         aligned = _collector(settings, paths.tiles(draft) / "moved")
         record = make_product(recipe, points, draft, aligned=aligned, run=run)
+        record["warnings"] += change_notices(changed(folder))
         record |= {
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "seconds": seconds | {"All": round(time.perf_counter() - began, 3)},

@@ -15,6 +15,8 @@ from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
 from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import geopandas as gpd
     from numpy.typing import NDArray
 
@@ -104,6 +106,11 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
         "may have been taken for the next; see that both have the right CRS and the same base station"
     )
     return [remark]
+
+
+def change_notices(kept: Mapping[str, str]) -> list[str]:
+    """That files of an earlier product stay, by another name, as somebody has changed them: a sentence each."""
+    return [f"{name} was changed since it was made: it stays beside the new one, as {as_}" for name, as_ in kept.items()]
 
 
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:

@@ -20,6 +20,7 @@ from vinemap.errors import PASSING, BusyError, InputError
 from vinemap.geo.boundaries import points_near, read_parcel
 from vinemap.geo.crs import is_local
 from vinemap.geo.layers import read_points, some_of
+from vinemap.product.qgis.changed import changed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -291,10 +292,11 @@ class Product(NamedTuple):
 
 
 def product_in(folder: Path) -> Product | None:
-    """The product in a folder; None where there is none, or not all of its files."""
+    """The product in a folder; None where there is none, or not all of its files, but for what is ``changed``."""
     try:
         record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        if any((folder / name).stat().st_size != size for name, size in record["files"].items()):
+        others = [name for name, size in record["files"].items() if (folder / name).stat().st_size != size]
+        if others and not set(others) <= changed(folder).keys():
             return None
         known = record["key"], record["parcel"], record["counts"]["rows"], record["length_m"]
         return Product(*known, tuple(record["warnings"]))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from vinemap import paths
 from vinemap.compute.locks import held
 from vinemap.errors import OutputError, VinemapError
+from vinemap.product.qgis.changed import changed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -77,9 +78,9 @@ def product(target: Path, *, drafts: Path | None = None, within: Path | None = N
     """Give a folder to write a product into, and put it in place of ``target`` if all went well.
 
     An earlier product is replaced whole, at one stroke where the system can do that (on Linux), and other files beside
-    it stay. In a folder that holds something else and isn't one of a survey's, the product's files replace those of
-    the same name. The folder is made beside the target, or among ``drafts``, on the same disk; in the target if that is
-    a disk of its own, whose files are replaced one by one.
+    it stay, as do its own that were ``changed``, by another name. In a folder that holds something else and is none of
+    a survey's, the product's files replace those of the same name. The folder is made beside the target, or among
+    ``drafts``, on the same disk; in the target if that is a disk of its own, whose files are replaced one by one.
 
     Parameters
     ----------
@@ -225,6 +226,8 @@ def _publish(draft: Path, target: Path, *, replace: bool) -> None:
         draft.rename(target)
         return
     whole = replace or _is_earlier(target, draft)
+    for name, kept in changed(target).items():
+        _keep(target / name, draft / kept)
     new = [path.relative_to(draft).as_posix() for path in draft.rglob("*") if not _is_folder(path)]
     ours, others = _parted(target, {paths.RUN, *new, *(_recorded(target) if whole else ())})
     if whole and draft.parent != target:
