@@ -196,7 +196,7 @@ def test_more_that_is_too_tall_than_trees(area, told):
     ] * told
 
 
-@pytest.mark.parametrize(("height", "told"), [(6.2, "6.2 m high"), (0.002, "0.0 m high"), (190.0, "190.0 m high")])
+@pytest.mark.parametrize(("height", "told"), [(6.2, "6.2 m high"), (0.002, "0.002 m high"), (190.0, "190 m high")])
 def test_no_row_among_heights_that_no_vineyard_has(height, told):
     seen = chm()
     seen.values[:, ::4] = height

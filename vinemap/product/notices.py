@@ -110,7 +110,9 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
 
 def change_notices(kept: Mapping[str, str]) -> list[str]:
     """That files of an earlier product stay, by another name, as somebody has changed them: a sentence each."""
-    return [f"{name} was changed since it was made: it stays beside the new one, as {as_}" for name, as_ in kept.items()]
+    return [
+        f"{name} was changed since it was made: it stays beside the new one, as {other}" for name, other in kept.items()
+    ]
 
 
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:
@@ -172,7 +174,7 @@ def height_notices(rows: gpd.GeoDataFrame, chm: Raster, unmapped: gpd.GeoDataFra
         top = float(np.quantile(known, TOP)) if len(known) else LOWEST
         if LOWEST <= top <= highest:
             return []
-        return [f"what stands there is up to {top:.1f} m high; if that can't be, {unit}"]
+        return [f"what stands there is up to {top:.3g} m high; if that can't be, {unit}"]
     lacking = int(rows["height_m"].isna().sum())
     stations = shapely.get_coordinates(shapely.segmentize(shapely.force_2d(rows.geometry.to_numpy()), STEP))
     over = np.mean(chm.values.ravel()[cell_of(stations, chm.grid)] > highest)

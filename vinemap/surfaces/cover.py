@@ -58,6 +58,9 @@ PLANTS, BROAD, FEW = 0.25, 0.9, 0.2
 a row that may be as broad, or as high as those that touch, all the same."""
 FOOT, LEAST = 0.4, 0.2
 """Share of the canopies' height, and metres, from which low canopies are told from what grows beneath them."""
+FAINT, DOUBLE, SOME = 0.65, 2.0, 0.1
+"""Shares of the height from which something is a canopy: low canopies between these are one planting, all of which
+counts where at least so much of it reaches that height."""
 RIDGE = 0.75
 """Share of the canopies' height above which rows stand apart that touch below it."""
 ROOF, FULL, UPPER = 5.0, 0.9, 0.75
@@ -123,7 +126,7 @@ def canopy_cover(
     grid = grid_over(*cloud.extent, resolution=resolution)
     flat, lone = (_grown(things(chm, high), MARGIN, chm.grid.resolution) for things in (flat_things, trees))
     top = height_about(replace(chm, values=np.where(flat | lone, np.nan, chm.values)), high)
-    foot = np.where(top >= LOWEST, np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
+    foot = np.where(_grows(top), np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
     metres = coarser(chm.grid, resolution=1.0)
     counts = _counts(cloud, grid, metres, (foot, ridge), high)
@@ -154,6 +157,15 @@ def canopy_cover(
     if roofs.any():
         cover[spread(_grown(roofs, MARGIN, chm.grid.resolution), chm.grid, grid)] = 0.0
     return Raster(cover, grid, cloud.crs), levels
+
+
+def _grows(top: Values) -> Flags:
+    """Cells (ny, nx) in which canopies grow, by their height, and not grass: of low ones the lowest, too."""
+    out: Flags = top >= LOWEST
+    part = label((top >= FAINT * LOWEST) & (top < DOUBLE * LOWEST), np.ones((3, 3)))[0]
+    share = np.bincount(part[out], minlength=part.max() + 1) / np.maximum(np.bincount(part.ravel()), 1)
+    out |= (part > 0) & (share >= SOME)[part]
+    return out
 
 
 def _share(canopy: Counts, everything: Counts, sigma: float, more: float) -> Values:
