@@ -106,10 +106,11 @@ def test_no_key_points():
     assert "cluster" in found.columns
 
 
-def test_rows_end_at_a_track_but_not_at_missing_vines():
-    """Rows on both sides of a track of 5 m; one of them also lacks vines for 6 m where its neighbours stand."""
+@pytest.mark.parametrize("track", [3.0, 5.0])
+def test_rows_end_at_a_track_but_not_at_missing_vines(track):
+    """Rows on both sides of it; one of them also lacks vines for 6 m where its neighbours stand."""
     west = [np.array([[0, 2.5 * k], [30, 2.5 * k]]) for k in range(5)]
-    east = [np.array([[35, 2.5 * k + 0.1], [60, 2.5 * k + 0.1]]) for k in range(5)]
+    east = [np.array([[30 + track, 2.5 * k + 0.1], [60, 2.5 * k + 0.1]]) for k in range(5)]
     points = key_points(west + east)
     x = points.geometry.x
     points = points[~((points["truth"] == 2) & (x > 10) & (x < 16))].reset_index(drop=True)

@@ -137,7 +137,7 @@ class ClusteringOptions(Options):
     across: float = Field(0.2, gt=0, le=2, description="semi-axis across the row (spacings)")
     min_points: int = Field(6, ge=1, description="key points of a piece")
     max_gap: float = Field(20.0, ge=0, le=100, description="missing vines that a row bridges (m)")
-    track_width: Metres = Field(3.5, description="gap shared by the neighbours that is a track (m)")
+    track_width: Metres = Field(2.5, description="gap shared by the neighbours that is a track (m)")
 
 
 class KnownRowOptions(Options):

@@ -41,7 +41,7 @@ def cluster_rows(
     across: float = 0.2,
     min_points: int = 6,
     max_gap: float = 20.0,
-    track_width: float = 3.5,
+    track_width: float = 2.5,
     high: float = 3.6,
 ) -> gpd.GeoDataFrame:
     """Label the key points of each row.

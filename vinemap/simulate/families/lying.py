@@ -37,10 +37,10 @@ def two_blocks(rng: np.random.Generator) -> Survey:
 
 
 def headland(rng: np.random.Generator) -> Survey:
-    """Two blocks of one direction, end to end, with a headland between them."""
+    """Two blocks of one direction, end to end, with a track or a headland between them."""
     azimuth, spacing, n = rng.uniform(0, 180), rng.uniform(2.2, 2.9), rng.integers(6, 9)
     one, other = (block(rng, n=n, azimuth=azimuth, spacing=spacing, length=rng.uniform(24, 32)) for _ in range(2))
-    return survey_of(rng, one, beyond(one, other, azimuth=azimuth, track=6), ragged=0.3)
+    return survey_of(rng, one, beyond(one, other, azimuth=azimuth, track=rng.uniform(3.2, 6)), ragged=0.3)
 
 
 def close(rng: np.random.Generator) -> Survey:
