@@ -119,6 +119,21 @@ def test_gaps_without_any_order_tell_no_spacing():
     assert told <= 1
 
 
+def test_bushes_most_of_whose_narrow_gaps_are_hidden():
+    """So that canopies are longer than vines that stand apart make, by whose width alone gaps would tell half of it."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for _, place, gone, extent, _ in planted(1.5, extent=0.95, length=60.0, rows=16):
+        there = place[~gone]
+        ends, begins = there[:-1] + extent / 2, there[1:] - extent / 2
+        seen = (begins - ends > 1) | (rng.random(len(ends)) < 0.1)
+        off = rng.normal(0, 0.03, (2, seen.sum()))
+        length = place[-1] + extent / 2
+        rows.append(Edges(length, np.append(ends[seen] + off[0], length), np.append(begins[seen] + off[1], 0.0)))
+    assert np.concatenate([row.runs for row in rows]).mean() > 3
+    assert estimate_spacing(rows) == pytest.approx(1.5, abs=0.02)
+
+
 def test_blocks_have_their_own_spacing_and_lend_it_to_those_without():
     rows = planted(0.9, rows=6) + planted(1.5, rows=6, block=2, south=20, seed=1)
     rows += planted(0.9, rows=2, block=3, south=40, seed=2, dead=0)

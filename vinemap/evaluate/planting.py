@@ -77,7 +77,8 @@ def estimate_spacing(rows: Sequence[Edges]) -> float | None:
 
     All edges of a row at which canopy ends lie whole numbers of vines apart, so do those at which it begins, and one
     kind from the other but for the vines' extent. The spacing is where the rows' periodograms together stand out from
-    what chance gives: for any extent, or else for a closed hedge, of which the lengths of gaps tell too.
+    what chance gives: for any extent, or else for a closed hedge, of which the lengths of gaps tell too. If vines would
+    stand apart by the first, though canopies are longer, the clearer of both counts: narrow gaps may be hidden.
     """
     told = [row for row in rows if len(row.gaps)]
     told = told[:: 1 + sum(len(row.gaps) for row in told) // MOST]
@@ -94,25 +95,27 @@ def estimate_spacing(rows: Sequence[Edges]) -> float | None:
     n = np.array([len(row.ends) for row in told], dtype=float)
     pairs = float(n @ (n - 1))
     run = float(np.concatenate([row.runs for row in told]).mean())
-    spacing = _clearest(frequency, power + 2 * np.abs(across), chance=6 * pairs, order=4 * pairs)
+    spacing, share = _clearest(frequency, power + 2 * np.abs(across), chance=6 * pairs, order=4 * pairs)
     if spacing and (run <= HEADS[1] * spacing or estimate_extent(told, spacing) >= HEADS[0] * spacing):
         return spacing
     hedge = 2 * ((across + own) * np.exp(2j * np.pi * HEDGE)).real
     more = 2 * float((n - 1).sum())
-    return _clearest(frequency, power + hedge, chance=4 * pairs + more, order=4 * pairs + more)
+    other, its = _clearest(frequency, power + hedge, chance=4 * pairs + more, order=4 * pairs + more)
+    return spacing if other and share > its else other
 
 
-def _clearest(frequency: Values, power: Values, *, chance: float, order: float) -> float | None:
-    """Spacing of the clearest frequency (n,), or of the lowest that is about as clear; None where all may be chance.
+def _clearest(frequency: Values, power: Values, *, chance: float, order: float) -> tuple[float | None, float]:
+    """Spacing of the clearest frequency (n,), or of the lowest that is about as clear, and the order that it has, to 1.
 
-    Told are the variance of what chance gives, and what perfect order gives.
+    It is None where all may be chance. Told are the variance of what chance gives, and what perfect order gives.
     """
     clear = power > max(CLEAR * np.sqrt(chance), ORDERLY * order, LOWEST * power.max())
     if not clear.any():
-        return None
+        return None, 0.0
     first = int(clear.argmax())
     last = first + int(np.argmin(np.append(clear[first:], False)))
-    return float(1 / frequency[first + power[first:last].argmax()])
+    best = first + power[first:last].argmax()
+    return float(1 / frequency[best]), float(power[best] / order)
 
 
 def _phasors(position: Values, frequency: Values) -> Values:
