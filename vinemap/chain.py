@@ -87,6 +87,7 @@ def map_rows(
     cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
     lines, remarks = (None, ()) if known is None else lines_here(known, seen, chm.crs)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
+    seen = seen.without(levels.crowns, chm.grid)
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     for stage in ("clustering", "fit"):
         options[stage]["high"] = settings.cover.high

@@ -60,7 +60,7 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
 def level_of(scene):
     """Half a metre everywhere."""
     level = Raster(np.full_like(scene.cover.values, 0.5), scene.cover.grid, UTM)
-    return Levels(level, level)
+    return Levels(level, level, np.zeros(level.grid.shape, dtype=bool))
 
 
 def fit(scene):

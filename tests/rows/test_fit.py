@@ -21,7 +21,8 @@ def test_wide_canopies_have_their_middle_between_their_flanks_and_are_followed_t
     fine, metres = (grid_over(xyz.min(axis=0), xyz.max(axis=0), resolution=side) for side in (0.1, 1.0))
     x, y = np.meshgrid(*fine.centres())
     of_ridges = ((x > 2) & (x < 14) & (y > -0.1) & (y < 0.7)).astype(np.float32)
-    levels = Levels(*(Raster(np.full(metres.shape, level, np.float32), metres, None) for level in (0.5, 1.3)))
+    heights = (Raster(np.full(metres.shape, level, np.float32), metres, None) for level in (0.5, 1.3))
+    levels = Levels(*heights, np.zeros(metres.shape, dtype=bool))
     course = gpd.GeoDataFrame(
         {"spacing_m": [2.4], "curtains_m": [0.0], "alone": [False]},
         geometry=[shapely.LineString([(start, 0.3), (end, 0.3)])],

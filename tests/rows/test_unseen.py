@@ -21,6 +21,7 @@ from vinemap.rows.standing.gaps import (
     lay_out,
 )
 from vinemap.simulate.plants import Vineyard
+from vinemap.simulate.rays import Obstacle
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate
 from vinemap.simulate.terrain import hillside
@@ -189,6 +190,21 @@ def test_voids_in_a_cloud_are_no_missing_vines(field):
     assert rows["cut"].iloc[-1] > 0.9
     assert rows["confidence"].iloc[-1] < rows["confidence"].iloc[:-1].min() - 0.05
     assert rows["end"].iloc[5] == pytest.approx(8, abs=0.2)
+
+
+def test_vines_beneath_the_crown_of_a_tree_are_not_seen():
+    """And none is missing there; three are, in another row."""
+    rows = rows_of(7, length=40)
+    x, y = rows[3][len(rows[3]) // 2]
+    tree = Obstacle(x, y, 2.2, 2.2, 6.0, 1.5)
+    survey = simulate([Vineyard("A", rows, gaps=(3,), dead=0)], hillside(0.05), obstacles=[tree], density=200, seed=4)
+    found = map_rows(PointCloud(survey.xyz, UTM))
+    assert len(found.rows) == 7
+    away = shapely.distance(found.gaps.geometry.to_numpy(), shapely.Point(x, y))
+    under = found.gaps[(away < 2.5) & (found.gaps["length_m"] > 1.5)]
+    assert set(under["state"]) == {UNSEEN}
+    assert 2.5 < under["length_m"].sum() < 6
+    assert found.gaps[away > 3]["state"].tolist() == [MISSING]
 
 
 def test_rows_end_at_holes_and_notches_of_their_parcel_and_canopies_that_it_cuts_are_told(field):

@@ -69,12 +69,14 @@ the heights thereabouts that is its height: posts and single shoots don't tell i
 
 
 class Levels(NamedTuple):
-    """Heights above ground from which points are canopy, in metres, in cells of 1 m."""
+    """Heights above ground from which points are canopy, in metres, in cells of 1 m; and what hides some."""
 
     body: Raster
     """Of canopies whole."""
     ridge: Raster
     """Of what stands apart: the same but where rows touch."""
+    crowns: Flags
+    """Cells (ny, nx) of the height model beneath crowns of trees."""
 
     @property
     def touching(self) -> Flags:
@@ -121,7 +123,7 @@ def canopy_cover(
     cover : Raster
         0–1.
     levels : Levels
-        Heights from which points count as canopy.
+        Heights from which points count as canopy, and where trees stand.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
     flat, lone = (_grown(things(chm, high), MARGIN, chm.grid.resolution) for things in (flat_things, trees))
@@ -144,7 +146,7 @@ def canopy_cover(
         roofs &= ~spread(about, squares, chm.grid)
     apart = _apart(touching, closed, blocks[:3], squares, metres)
     apart.ravel()[cells_in(metres, chm.grid)[roofs]] = False
-    levels = Levels(*(Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot))))
+    of_body, of_ridge = (Raster(level, metres, cloud.crs) for level in (foot, np.where(apart, ridge, foot)))
     canopy = body
     if apart.any():
         canopy = np.where(spread(apart, metres, grid), crown, body)
@@ -156,7 +158,7 @@ def canopy_cover(
     cover[no_vines.repeat(k, axis=0).repeat(k, axis=1)[: grid.ny, : grid.nx]] = 0.0
     if roofs.any():
         cover[spread(_grown(roofs, MARGIN, chm.grid.resolution), chm.grid, grid)] = 0.0
-    return Raster(cover, grid, cloud.crs), levels
+    return Raster(cover, grid, cloud.crs), Levels(of_body, of_ridge, lone)
 
 
 def _grows(top: Values) -> Flags:

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion
 
 from vinemap.compute.threads import in_threads, stretches
 from vinemap.geo.curve import across, resample, way_along
-from vinemap.geo.raster import Grid, block_sum, cell_of
+from vinemap.geo.raster import Grid, block_sum, cell_of, spread
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +42,11 @@ class Seen(NamedTuple):
         """Whether points (n, ≥2) lie where something was seen; beyond the grid nothing was."""
         out: Flags = self.cells.ravel()[cell_of(xy, self.grid)]
         return out
+
+    def without(self, cells: Flags, grid: Grid) -> Seen:
+        """The same but for what lies beneath cells (ny, nx) of a grid."""
+        here, of_points = (~spread(cells, grid, own) for own in (self.grid, self.fine))
+        return self._replace(cells=self.cells & here, points=self.points & of_points)
 
     def hidden(self, curve: Values, half: float) -> Values:
         """Stretches (k, 2), in metres along a curve (n, 2), that show nothing within ``half`` metres of it.
