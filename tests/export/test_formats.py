@@ -157,8 +157,9 @@ def test_a_row_drawn_by_hand(tmp_path, product, column):
     rows = pyogrio.read_dataframe(drawn / f"{NAME}.gpkg", layer="rows").astype({"row_id": "Int64", "block": "Int64"})
     rows.loc[1, column] = None
     pyogrio.write_dataframe(rows, drawn / f"{NAME}.gpkg", layer="rows", geometry_type="LineString Z")
-    with pytest.raises(InputError, match=rf"{NAME}\.gpkg: row with fid 2 has no {column}: fill that in, or delete"):
-        list(export_products([drawn], tmp_path / "out", formats=["geojson"]))
+    for format_ in ("geojson", "table"):
+        with pytest.raises(InputError, match=rf"{NAME}\.gpkg: row with fid 2 has no {column}: fill that in, or delete"):
+            list(export_products([drawn], tmp_path / "out", formats=[format_]))
 
 
 def test_wrong_products_and_places(tmp_path, product):

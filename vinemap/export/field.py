@@ -20,7 +20,7 @@ from vinemap.geo.main import Corner, Origin, origin_of, to_main
 from vinemap.product.seasons.products import places_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 
@@ -135,6 +135,31 @@ def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
     return folder, record
 
 
+def read_layers(
+    path: Path, others: Sequence[str] = (), *, wanted: Sequence[str] = ()
+) -> tuple[gpd.GeoDataFrame, dict[str, gpd.GeoDataFrame]]:
+    """Rows of a product's GeoPackage, and other layers of it; of what is ``wanted`` those that it has.
+
+    Raises
+    ------
+    InputError
+        If it can't be read, or has a row without number, name, block or line, as somebody may have drawn one.
+    """
+    try:
+        rows = pyogrio.read_dataframe(path, layer="rows", fid_as_index=True)
+        there = [name for name in wanted if name in pyogrio.list_layers(path)[:, 0]]
+        layers = {name: pyogrio.read_dataframe(path, layer=name) for name in (*others, *there)}
+    except (DataSourceError, DataLayerError) as error:
+        raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
+    for column in ("row_id", "label", "block", "geometry"):
+        if (lacking := rows[column].isna()).any():
+            raise InputError(
+                f"{naming.shown(path)}: row with fid {lacking.idxmax()} has no {column}: fill that in, or delete the "
+                "row, or map the parcel with it among known rows (--rows)"
+            )
+    return rows.reset_index(drop=True), layers
+
+
 def read_field(product: Path, *, lines: str, headland: float, outer: bool, vertices: int | None = None) -> Field:
     """Read a product, given by its folder or its GeoPackage, and draw its lanes if they are wanted.
 
@@ -147,19 +172,9 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     folder, record = read_record(product)
     parcel, origin = record["parcel"], origin_of(record["origin"])
     path = paths.geopackage(folder, parcel)
-    try:
-        rows = pyogrio.read_dataframe(path, layer="rows", fid_as_index=True)
-        layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("row_ends", "gaps", "parcel")}
-    except (DataSourceError, DataLayerError) as error:
-        raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
+    rows, layers = read_layers(path, ("row_ends", "gaps", "parcel"))
     if len(rows) == 0:
         raise InputError(f"{naming.shown(path)}: has no row to export")
-    for column in ("row_id", "label", "block", "geometry"):
-        if (lacking := rows[column].isna()).any():
-            raise InputError(
-                f"{naming.shown(path)}: row with fid {lacking.idxmax()} has no {column}: fill that in, or delete the "
-                "row, or map the parcel with it among known rows (--rows)"
-            )
     rows = rows.sort_values("row_id", ignore_index=True)
     bounded = bool(record.get("bounded"))
     within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None

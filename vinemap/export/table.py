@@ -11,14 +11,12 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
-import pyogrio
-from pyogrio.errors import DataLayerError, DataSourceError
 
 from vinemap import naming, paths
 from vinemap.compute.threads import in_threads
 from vinemap.errors import InputError
 from vinemap.evaluate.changes import follow_rows
-from vinemap.export.field import read_record
+from vinemap.export.field import read_layers, read_record
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.product.layers import REAL, TEXT, WHOLE
 from vinemap.product.seasons.products import Product, read_product, same_places, shift_between
@@ -180,11 +178,8 @@ def _folder_and_record(product: Path) -> tuple[Path, tuple[Path, dict[str, Any]]
 def _read(folder: Path, record: dict[str, Any]) -> _Product:
     parcel = record["parcel"]
     path = paths.geopackage(folder, parcel)
-    try:
-        rows = pyogrio.read_dataframe(path, layer="rows")
-        vines = pyogrio.read_dataframe(path, layer="vines") if "vines" in pyogrio.list_layers(path)[:, 0] else None
-    except (DataSourceError, DataLayerError) as error:
-        raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
+    rows, layers = read_layers(path, wanted=["vines"])
+    vines = layers.get("vines")
     if vines is not None and not is_local(vines.crs):
         places = vines.geometry.to_crs(WGS84)
         vines = vines.assign(lat=places.y, lon=places.x)
