@@ -30,3 +30,15 @@ def test_a_hedge_across_the_end_is_no_vine():
     standing = cut_to_canopy(np.column_stack([x, 0 * x]), wide * 1.0, wide * 1.0, 0.6)
     assert standing is not None
     assert np.allclose(standing.curve[[0, -1], 0], [3, 14.5], atol=0.1)  # rows that touch all along
+
+
+def test_a_car_behind_a_row_is_no_vine():
+    """Far wider than its canopy, and not as long as rows; a last vine that is twice as wide is one."""
+    x, offsets = np.arange(400) * CELL, np.arange(-24, 25) * CELL
+    vines = ((x > 3) & (x < 12))[:, None] & (np.abs(offsets) < 0.3)
+    for half, until, end in ((0.95, 17, 12), (0.6, 14, 14), (0.95, 19.5, 19.5)):
+        behind = ((x > 13.5) & (x < until))[:, None] & (np.abs(offsets) < half)
+        image = (vines | behind).astype(float)
+        standing = cut_to_canopy(np.column_stack([x, 0 * x]), image, image, 0.6)
+        assert standing is not None
+        assert np.allclose(standing.curve[[0, -1], 0], [3, end], atol=0.1)

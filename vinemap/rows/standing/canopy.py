@@ -21,10 +21,11 @@ SHORTEST = 0.35
 """Metres of canopy along a row, below which it is a stray shoot or weed and no vine."""
 OWN = 0.3
 """Share of a canopy across that must lie outside of another row's for it to tell where it ends."""
-ACROSS = 0.5
-"""Cover at the sides of what stands beyond an end, in that of its middle, from which it runs across the row."""
-HEDGE = 3.0
-"""Metres along a row that what runs across it takes at the most."""
+ACROSS, BROAD = 0.5, 2.5
+"""Cover at the sides of what stands beyond an end, in that of its middle, from which it runs across the row; and how
+many times as wide as the row's canopy a thing is, as a car, that isn't of it."""
+HEDGE, CAR = 3.0, 5.5
+"""Metres along a row that either takes at the most."""
 USUAL = 1.0
 """Metres between vines that are taken where nothing tells."""
 NOTHING = np.empty(0)
@@ -34,9 +35,10 @@ class Standing(NamedTuple):
     """Curve (n, 2), its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
 
     ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it. Before
-    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle. ``told`` says of either
-    end whether canopy tells it, as it does unless the end is known and nothing ends near it. ``half`` is the canopy's
-    half width in metres, at half its cover and at the ``EDGE`` of it.
+    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle, and ``wide`` (k,) is its
+    width in that of the row's canopy. ``told`` says of either end whether canopy tells it, as it does unless the end is
+    known and nothing ends near it. ``half`` is the canopy's half width in metres, at half its cover and at the ``EDGE``
+    of it.
     """
 
     curve: Values
@@ -44,6 +46,7 @@ class Standing(NamedTuple):
     contrast: float
     goes_on: tuple[bool, bool] = (False, False)
     sides: Values = NOTHING
+    wide: Values = NOTHING
     told: tuple[bool, bool] = (True, True)
     half: tuple[float, float] = (0.0, 0.0)
 
@@ -91,9 +94,12 @@ def find_canopy(
     long = np.diff(metres, axis=1)[:, 0] >= SHORTEST
     if not long.any():
         return None
-    sides = np.array([_sides(ridge[int(a) : int(b) + 1]) for a, b in np.array(runs)[long]])
+    parts = [slice(int(a), int(b) + 1) for a, b in np.array(runs)[long]]
+    sides = np.array([_sides(ridge[part]) for part in parts])
+    wide = np.array([_half(image[part].mean(axis=0), 0.5) for part in parts]) / max(_half(across, 0.5), CELL)
     contrast = float(np.clip(1 - _sides(ridge[profile > edge]), 0, 1))
-    return Standing(curve, metres[long], contrast, sides=sides, half=(_half(across, 0.5), _half(across, EDGE)))
+    half = _half(across, 0.5), _half(across, EDGE)
+    return Standing(curve, metres[long], contrast, sides=sides, wide=wide, half=half)
 
 
 def _half(across: Values, share: float) -> float:
@@ -142,13 +148,16 @@ def cut_to_canopy(
 
 
 def _along(row: Standing) -> Values:
-    """Runs of a row's canopy without those beyond its ends that run across it, as a hedge does.
+    """Runs of a row's canopy without those beyond its ends that run across it, as a hedge does, or are far too wide.
 
     Where most of its canopy reaches to both sides none can be told.
     """
     if np.median(row.sides) > ACROSS / 2:
         return row.runs
-    own = np.flatnonzero((row.sides <= ACROSS) | (np.diff(row.runs, axis=1)[:, 0] > HEDGE))
+    length = np.diff(row.runs, axis=1)[:, 0]
+    across = row.sides > ACROSS
+    others = (across & (length <= HEDGE)) | (~across & (row.wide > BROAD) & (length <= CAR))
+    own = np.flatnonzero(~others)
     return row.runs[own[0] : own[-1] + 1]
 
 
