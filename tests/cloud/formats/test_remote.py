@@ -124,6 +124,8 @@ def test_a_file_that_changes_is_another(folder):
         (path,) = cloud_files(address(server))
         before, digest = stamp_of(path), digest_of(path)
         assert (stamp_of(path), digest_of(path)) == (before, digest)
+        signed = [address(server, f"a.copc.laz?signature={key}") for key in "12"]
+        assert digest_of(signed[0]) == digest_of(signed[1]) == digest
         server.tag = '"2"'
         assert stamp_of(path) != before
         assert digest_of(path) != digest

@@ -57,7 +57,8 @@ def digest_of(path: Path) -> str:
     """
     if naming.url_of(path):
         file = Ranges(path)
-        told = f"{file.url} {file.size} {file.tag} {file.modified}".encode()
+        place = file.url.partition("?")[0]  # behind it may stand who asks, and until when
+        told = f"{place} {file.size} {file.tag} {file.modified}".encode()
         return hashlib.sha256(told + file.beginning).hexdigest()
     first, *others = parts_of(path)
     digests = [_sha256(first), *(f"{part.relative_to(path.parent).as_posix()} {_sha256(part)}" for part in others)]
