@@ -105,6 +105,40 @@ def test_terraces():
     assert np.quantile(error, 0.95) < 0.25
 
 
+def narrow_terraces(wall, density):
+    """Terraces 2.5 m wide with dry-stone walls, and on each a row, beneath which every other point sees no soil."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, [[24], [20]], (2, 480 * density))
+
+    def ground(x, y):
+        return 0.03 * y + wall * np.floor((x + 0.3 * y) / 2.5)
+
+    z = ground(x, y) + rng.normal(0, 0.015, len(x))
+    canopy = (np.abs((x + 0.3 * y) % 2.5 - 1.25) < 0.25) & (rng.random(len(x)) < 0.5)
+    z[canopy] += rng.uniform(0.6, 1.7, canopy.sum())
+    return np.column_stack([x, y, z]), ground
+
+
+@pytest.mark.parametrize("density", [90, 300])
+@pytest.mark.parametrize("wall", [0.7, 1.5])
+def test_narrow_terraces_up_to_the_brows_of_their_walls(wall, density):
+    xyz, ground = narrow_terraces(wall, density)
+    dtm = terrain_model(PointCloud(xyz, UTM))
+    error = (dtm.values - ground(*np.meshgrid(*dtm.grid.centres())))[4:-4, 4:-4]
+    assert abs(np.median(error)) < 0.02
+    assert np.mean(error < -0.2) < 0.02
+    assert np.mean(error > 0.2) < 0.06  # what lies in a cell with a wall is as high as its brow
+
+
+def test_a_level_roof_is_no_terrace():
+    """However large it is, and low: nothing leads up to it."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 20, (2, 80_000))
+    roof = (np.abs(x - 10) < 1.0) & (np.abs(y - 10) < 2.2)
+    cloud = PointCloud(np.column_stack([x, y, rng.normal(0, 0.02, len(x)) + 0.9 * roof]), UTM)
+    assert np.abs(terrain_model(cloud).values).max() < 0.1
+
+
 def test_trees_houses_weeds_and_floaters():
     rows = rows_of(6, length=25)
     x, y = rows[0].mean(axis=0)
@@ -122,6 +156,12 @@ def test_closed_canopy():
     error = np.abs(errors(survey))
     assert np.median(error) < 0.05
     assert np.quantile(error, 0.95) < 0.15
+
+
+def test_a_low_dense_canopy_is_no_soil_though_it_begins_there():
+    rows = rows_of(10, length=20, spacing=1.7)
+    low = Vineyard("A", rows, height=0.5, half_width=0.4, bottom=0.0)
+    assert np.quantile(errors(simulate([low], hillside(0.1), seed=0)), 0.95) < 0.03
 
 
 def test_heights_and_canopy_height_model(vineyard, cloud):

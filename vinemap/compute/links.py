@@ -14,6 +14,6 @@ if TYPE_CHECKING:
 
 def parts_of(n: int, one: Ints, other: Ints) -> Ints:
     """Number of the part, from 0, to which each of n things (n,) belongs; links are ``one`` to ``other`` (k,)."""
-    graph = coo_array((np.ones(len(one)), (one, other)), shape=(n, n))
+    graph = coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(n, n))
     out: Ints = connected_components(graph, directed=False)[1]
     return out

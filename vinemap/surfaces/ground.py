@@ -3,7 +3,8 @@
 A cell tells its terrain by a low order statistic of the heights in it, corrected for the statistic's expected
 depth below the mean of the noise. Local planes are fitted to the cells, from coarse to fine; cells that stand
 above them (canopy, trees, houses) lose their weight, so that under a closed canopy the surface is carried on
-from around. On terraces a patch may stand above the fit if its points lie in one thin layer, as soil does.
+from around. On terraces soil may stand off the fit, up to the brow of a wall and down to its foot, if it hangs
+together with soil on the fit in one thin layer; at the wall itself it stays where its cells tell it.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_opening, gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.special import ndtr, ndtri
 
 from vinemap.cloud.bins import cells_a_block
+from vinemap.compute.links import parts_of
 from vinemap.errors import InputError
 from vinemap.geo.raster import Grid, Raster, cell_of, coarser, grid_over, sample
 from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
@@ -22,7 +24,7 @@ from vinemap.surfaces.statistics import order_statistics
 
 if TYPE_CHECKING:
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Floats
+    from vinemap.compute.arrays import Flags, Floats, Ints, Values
 
 GROUND = 2
 """ASPRS class of ground."""
@@ -34,6 +36,10 @@ NEAR = 0.3
 """Metres over which the last planes are fitted, and over which cells tell of weeds together."""
 UNEVEN = 0.05
 """Share by which bare soil may be noisier at one place than at another."""
+ON_IT = 0.1
+"""Share of a layer's cells from which on it is soil, if they lie on what was fitted to all."""
+STEEP = 0.5
+"""Rise over run from which on what was fitted may run across a wall."""
 
 
 class _Cells(NamedTuple):
@@ -67,7 +73,7 @@ def terrain_model(
     tolerance : float
         Metres that a cell may stand above the surface around it and still count as terrain.
     terrace_height : float
-        Metres up to which a raised thin layer counts as a terrace; 0 where there are none.
+        Metres that soil of a terrace may stand off the surface around it; 0 where there are none.
     engine : str
         "vinemap", or "pdal": the surface through the points that PDAL classified as ground, for which of all
         these only ``resolution`` counts.
@@ -88,10 +94,10 @@ def terrain_model(
     for _ in range(2):
         n, found = order_statistics(cloud, surface, grid, (quantile, 0.5, 0.9))
         cells = _Cells(n, *found)
-        fitted = _fit_terrain(cells, resolution, quantile, tolerance, terrace_height)
+        fitted = _fit_terrain(cells, surface.values, resolution, quantile, tolerance, terrace_height)
         surface = Raster(surface.values + fitted, grid, cloud.crs)
         # On slopes and terraces that were new to it, soil is thin only once cells lie along them.
-        if min(grid.shape) < 2 or np.quantile(np.hypot(*np.gradient(fitted)), 0.95) < EVEN:
+        if np.quantile(_fall(fitted), 0.95) < EVEN:
             break
     return surface
 
@@ -129,8 +135,10 @@ def classified_terrain(cloud: Cloud, *, resolution: float = 0.25) -> Raster:
     return Raster(surface + reference, grid, cloud.crs)
 
 
-def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: float, terrace_height: float) -> Floats:
-    """Terrain (ny, nx) that cells tell, in their own heights."""
+def _fit_terrain(
+    cells: _Cells, base: Values, resolution: float, quantile: float, tolerance: float, terrace_height: float
+) -> Floats:
+    """Terrain (ny, nx) that cells tell, in their own heights, which are above a base (ny, nx)."""
     half, points = _half_spread(cells, quantile, NEAR / resolution)
     noise = _noise(half, points)
     share = _soil_share(half / noise, points, quantile)
@@ -139,15 +147,47 @@ def _fit_terrain(cells: _Cells, resolution: float, quantile: float, tolerance: f
     weight = np.where(cells.n > 0, np.minimum(cells.n, 15.0) / (1 + (spread / (8 * noise)) ** 2), 0.0)
     # How high weeds have lifted a low height is a guess: bare soil beside them knows better.
     weight /= 1 + (2 * (1 - share)) ** 2
-    thin = binary_opening((cells.n > 3) & (spread < 8 * noise), np.ones((3, 3)))
+    # From one quantile to the other, soil spans some 2.6 times its noise, and as much as the base falls beneath it.
+    thin = (cells.n > 1) & (spread < 4 * noise + (0.9 - quantile) * _fall(base))
+    layer = _layers(np.where(cells.n > 0, base + level, np.nan), thin, tolerance)
+    size = np.bincount(layer.ravel())
     surface = np.zeros(level.shape)
     for reach, slack in ((1.5, 4.0), (1.5, 2.5), (1.0, 1.5), (0.6, 1.0), (0.6, 1.0)):
         above = level - surface
-        terrain = above < slack * tolerance
-        terrain |= thin & (above < terrace_height)
-        terrain &= above > -3 * slack * tolerance
+        on_it = np.bincount(layer[np.abs(above) < tolerance], minlength=len(size)) > ON_IT * size
+        soil = on_it[layer] & (np.abs(above) < terrace_height)
+        terrain = soil | (above < slack * tolerance) & (above > -3 * slack * tolerance)
         surface = multiscale_fit(level, weight * terrain, reach / resolution)
-    return multiscale_fit(level, weight * terrain, NEAR / resolution)
+    surface = multiscale_fit(level, weight * terrain, NEAR / resolution)
+    steep = _fall(base + surface) > STEEP * resolution
+    edge = soil & thin & steep & (np.abs(level - surface) > tolerance)
+    # What lies in a cell at a wall is wall, up to its brow.
+    brow = maximum_filter(np.where(edge, base + level, -np.inf), 3) - base
+    wall = np.where(steep & ~(soil & thin), np.where(cells.n > 0, np.minimum(brow, cells.high), brow), -np.inf)
+    out: Floats = np.where(edge, level, np.maximum(surface, wall))
+    return out
+
+
+def _layers(height: Floats, thin: Flags, step: float) -> Ints:
+    """Layer (ny, nx) of each cell: cells beside each other, within a step in height, are of one if either is thin."""
+    return parts_of(height.size, *_links(height, thin, step)).reshape(height.shape)
+
+
+def _links(height: Floats, thin: Flags, step: float) -> Ints:
+    """Flat indices (2, k) of cells that are of one layer."""
+    index = np.arange(height.size, dtype=np.int32).reshape(height.shape)
+    ends = []
+    for i, j in (0, 1), (1, 0), (1, 1), (1, -1):
+        one = np.s_[i:, max(j, 0) : j or None if j < 0 else None]
+        other = np.s_[: -i or None, max(-j, 0) : -j if j > 0 else None]
+        linked = (thin[one] | thin[other]) & (np.abs(height[one] - height[other]) < step)
+        ends.append(np.stack([index[one][linked], index[other][linked]]))
+    return np.concatenate(ends, axis=1)
+
+
+def _fall(surface: Values) -> Floats:
+    """Metres that a surface falls across each of its cells (ny, nx)."""
+    return np.hypot(*np.gradient(surface)) if min(surface.shape) > 1 else np.zeros(surface.shape)
 
 
 def _coarse_surface(cloud: Cloud, grid: Grid, blocks: int) -> Floats:
