@@ -27,6 +27,7 @@ REMARKS = {
     "product/register/edits.py",
     "product/store.py",
     "product/write.py",
+    "rows/curtains.py",
     "rows/known.py",
     "surfaces/lines.py",
 }

@@ -11,6 +11,7 @@ from vinemap.evaluate.confidence import believed, judge_rows
 from vinemap.evaluate.shift import Shift, measure_shift
 from vinemap.rows.blocks import flag_rows, group_blocks
 from vinemap.rows.clusters import cluster_rows
+from vinemap.rows.curtains import curtain_remarks
 from vinemap.rows.curves import trace_rows
 from vinemap.rows.field import estimate_row_field, refine_row_field
 from vinemap.rows.fit import fit_rows
@@ -49,7 +50,7 @@ class RowMap(NamedTuple):
     rows: gpd.GeoDataFrame
     gaps: gpd.GeoDataFrame
     remarks: Sequence[str] = ()
-    """What is to be known of known rows: a sentence each."""
+    """What is to be known of known rows, or of rows in pairs: a sentence each."""
     shift: Shift | None = None
     """How far the cloud lies off them, where that is told."""
 
@@ -85,7 +86,7 @@ def map_rows(
     settings = settings or Settings()
     options = settings.model_dump()
     cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
-    lines, remarks = (None, ()) if known is None else lines_here(known, seen, chm.crs)
+    lines, remarks = (None, []) if known is None else lines_here(known, seen, chm.crs)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
     seen = seen.without(levels.crowns, chm.grid)
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
@@ -97,6 +98,7 @@ def map_rows(
         n_key_points = len(key_points)
         clusters = step("Clusters", cluster_rows, key_points, cover, chm, **options["clustering"])
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
+        remarks = curtain_remarks(courses)
         del key_points, clusters  # much memory
     else:
         lines, within = space_lines(lines, field), None
@@ -115,7 +117,7 @@ def map_rows(
         rows, gaps = number_rows(flag_rows(rows), gaps)
     else:
         rows, gaps, told = name_rows(lines, courses, flag_rows(rows), gaps)
-        remarks = *remarks, *told
+        remarks = [*remarks, *told]
     rows, gaps = count_missing(rows, gaps, **options["missing"])
     field = refine_row_field(field, rows)
     return RowMap(cloud, dtm, chm, cover, seen, field, n_key_points, rows, gaps, remarks, shift)

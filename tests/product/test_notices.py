@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.product.notices import height_notices, known_notices, notices, sight_notices
+from vinemap.product.notices import height_notices, known_notices, notices, pair_notices, sight_notices
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
@@ -244,3 +244,33 @@ def test_rows_of_another_planting_are_told_from_a_shift(spacing, shift, some):
     assert len(said) == some
     assert not said or "of 8 rows stand 0." in said[0]
     assert known_notices(seen.iloc[:2], known) == known_notices(seen.assign(support=0.0), known) == []
+
+
+def side_by_side(*distances, spacing=1.3):
+    """Rows of 30 m, so far from each other."""
+    at = np.cumsum([0.0, *distances])
+    lines = [shapely.LineString([(WEST, NORTH + y, 200), (WEST + 30, NORTH + 5 + y, 201)]) for y in at]
+    return gpd.GeoDataFrame({"spacing_m": spacing}, geometry=lines, index=range(len(at)), crs=32632)
+
+
+def test_rows_that_stand_in_pairs():
+    turn = 30 / np.hypot(30, 5)
+    (told,) = pair_notices(side_by_side(*(np.array([1.2, 2.8, 1.2, 2.8, 1.2]) / turn)))
+    assert told.startswith("rows stand in pairs, 1.2 m apart and 2.8 m from the next ones: ")
+
+
+@pytest.mark.parametrize(
+    "distances",
+    [
+        [],
+        [1.2],
+        [1.2, 2.8],
+        [2.5] * 7,
+        [2.0, 2.6] * 4,
+        [1.2, 2.8, 1.2, 1.2, 1.2, 1.2, 1.2, 2.4, 1.2, 1.2],
+        [1.0, 3.4, 1.7, 2.2, 1.1],
+    ],
+)
+def test_rows_that_do_not(distances):
+    assert pair_notices(side_by_side(*distances)) == []
+    assert pair_notices(side_by_side()[:0]) == []

@@ -48,7 +48,13 @@ def scene(lines, holes=(), width=0.5, resolution=0.1):
     data = np.concatenate(frames)
     data = data[np.random.default_rng(0).permutation(len(data))]
     points = gpd.GeoDataFrame(
-        {"direction_deg": data[:, 2], "cluster": data[:, 3].astype(int), "spacing_m": 2.5, "curtains_m": 0.0},
+        {
+            "direction_deg": data[:, 2],
+            "cluster": data[:, 3].astype(int),
+            "spacing_m": 2.5,
+            "curtains_m": 0.0,
+            "told": False,
+        },
         geometry=gpd.points_from_xy(data[:, 0], data[:, 1]),
         crs=UTM,
     )

@@ -39,7 +39,7 @@ def test_centres_of_straight_rows(direction):
     assert np.abs((off / spacing + 0.5) % 1 - 0.5)[inside].max() * spacing < 0.02
     assert inside.sum() > 34 * 34 / spacing * 2
     assert np.allclose(points.get_coordinates(include_z=True)["z"], 7.0)
-    assert set(points.columns) == {"cover", "direction_deg", "spacing_m", "curtains_m", "geometry"}
+    assert set(points.columns) == {"cover", "direction_deg", "spacing_m", "curtains_m", "told", "geometry"}
     assert (points["curtains_m"] == 0).all()
 
 

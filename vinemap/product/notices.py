@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
+from vinemap.compute.beside import nearest_beside
 from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
 from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
 from vinemap.geo.crs import project
+from vinemap.geo.curve import at_each, tangents_of_each
 from vinemap.geo.raster import block_sum, cell_of
+from vinemap.rows.curtains import CLOSE
 from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
 from vinemap.surfaces.statistics import LOWEST
 
@@ -45,6 +48,10 @@ MOST_LEFT = 0.02
 """Share of a parcel on which something may stand that is in no row and might be vines."""
 MOST_TALL = 0.3
 """Share of a parcel on which trees don't stand."""
+BESIDE, PARALLEL = 3.0, 0.95
+"""Spacings within which rows stand beside each other, and cosine of the angle between them."""
+WIDEST, ALIKE, PAIRED = 1.8, 0.15, 0.5
+"""Metres between two curtains of a row, at the most, share by which pairs' distances may differ, and of rows in pairs."""
 MAIN = 0.1
 """Share of what is in no row from which a reason is worth to be told."""
 
@@ -106,6 +113,38 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
         "may have been taken for the next; see that both have the right CRS and the same base station"
     )
     return [remark]
+
+
+def pair_notices(rows: gpd.GeoDataFrame) -> list[str]:
+    """That rows stand in pairs, of which each may be one row of two curtains.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineString with ``spacing_m``.
+    """
+    curves = [shapely.get_coordinates(line) for line in rows.geometry]
+    places = [np.arange(SIDE / 2, length, SIDE) for length in shapely.length(rows.geometry)]
+    row = np.repeat(np.arange(len(rows)), [len(some) for some in places])
+    if len(row) == 0:
+        return []
+    at = curves, row, np.concatenate(places)
+    reach = BESIDE * rows["spacing_m"].to_numpy(dtype=float)[row]
+    away, _ = nearest_beside(at_each(*at), tangents_of_each(*at), row, reach, along=SIDE / 2, parallel=PARALLEL)
+    near, far = np.array([np.median(np.sort(away[row == k], axis=1), axis=0) for k in np.unique(row)]).T
+    inner = np.isfinite(far)
+    pairs = inner & (near <= np.minimum(CLOSE * far, WIDEST))
+    if not pairs.any():
+        return []
+    apart, beyond = np.median(near[pairs]), np.median(far[pairs])
+    pairs &= (np.abs(near / apart - 1) <= ALIKE) & (np.abs(far / beyond - 1) <= ALIKE)
+    if np.count_nonzero(pairs) < max(2, PAIRED * np.count_nonzero(inner)):
+        return []
+    told = (
+        f"rows stand in pairs, {apart:.1f} m apart and {beyond:.1f} m from the next ones: if each is a row of two "
+        "curtains, known rows tell it (--rows)"
+    )
+    return [told]
 
 
 def change_notices(kept: Mapping[str, str]) -> list[str]:

@@ -13,7 +13,14 @@ from vinemap.cloud.pdal.engine import made_by
 from vinemap.evaluate.meshes import NUMBERS
 from vinemap.geo.place import doubts_of
 from vinemap.product.json_values import jsonable
-from vinemap.product.notices import height_notices, known_notices, notices, shift_notices, sight_notices
+from vinemap.product.notices import (
+    height_notices,
+    known_notices,
+    notices,
+    pair_notices,
+    shift_notices,
+    sight_notices,
+)
 from vinemap.product.pages.page import mean_of
 from vinemap.surfaces.flights import disagreement
 
@@ -88,7 +95,7 @@ def record_of(
     square : bool
         Whether rows could as well run another way.
     remarks : sequence of str
-        What is to be known of known rows.
+        What is to be known of known rows, or of rows in pairs.
     shift : Shift, optional
         How far the cloud lies off them, or lay before it was moved.
     """
@@ -123,6 +130,7 @@ def record_of(
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
+        + ([] if recipe.known else pair_notices(layers["rows"]))
         + [SQUARE] * (square and not recipe.known),
         "versions": versions | made_by(recipe.settings.ground),
     }

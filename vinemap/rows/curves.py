@@ -72,7 +72,7 @@ def trace_rows(
     Parameters
     ----------
     key_points : GeoDataFrame
-        Points with ``cluster``, ``direction_deg``, ``spacing_m`` and ``curtains_m``.
+        Points with ``cluster``, ``direction_deg``, ``spacing_m``, ``curtains_m`` and ``told``.
     cover : Raster
         Canopy cover 0–1.
     threshold : float
@@ -89,13 +89,14 @@ def trace_rows(
     Returns
     -------
     GeoDataFrame
-        LineString with ``spacing_m``, ``curtains_m`` (between two curtains of a row, 0 where it has one) and ``alone``
-        (whether no other row runs beside it).
+        LineString with ``spacing_m``, ``curtains_m`` (between two curtains of a row, 0 where it has one), ``told``
+        (whether gaps tell that) and ``alone`` (whether no other row runs beside it).
     """
     xy, direction = key_points.get_coordinates().to_numpy(), np.radians(key_points["direction_deg"].to_numpy())
     spacing, curtains = key_points["spacing_m"].to_numpy(), key_points["curtains_m"].to_numpy()
+    told = key_points["told"].to_numpy()
 
-    def trace(members: Ints) -> tuple[float, float, float, float, float, shapely.LineString] | None:
+    def trace(members: Ints) -> tuple[float, float, bool, float, float, float, shapely.LineString] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
         between, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
         course = _centred(ordered, cover, between, double) if len(ordered) > 1 else None
@@ -104,11 +105,12 @@ def trace_rows(
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
         fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
-        return (between, double, course.width, course.amount, course.support, line) if fits else None
+        numbers = course.width, course.amount, course.support
+        return (between, double, bool(told[members].mean() > 0.5), *numbers, line) if fits else None
 
     clusters = key_points.groupby("cluster").indices
     records = [record for record in in_threads(trace, clusters.values()) if record]
-    columns = ("spacing_m", "curtains_m", "width", "amount", "support")
+    columns = ("spacing_m", "curtains_m", "told", "width", "amount", "support")
     rows = gpd.GeoDataFrame(
         {name: [r[k] for r in records] for k, name in enumerate(columns)},
         geometry=[r[-1] for r in records],
@@ -123,7 +125,8 @@ def trace_rows(
     least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
     alone = ~_accompanied(rows)
     odd = alone & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
-    return rows.assign(alone=alone).loc[~odd, ["spacing_m", "curtains_m", "alone", "geometry"]].reset_index(drop=True)
+    kept = ["spacing_m", "curtains_m", "told", "alone", "geometry"]
+    return rows.assign(alone=alone).loc[~odd, kept].reset_index(drop=True)
 
 
 def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -> Values:

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import geopandas as gpd
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, uniform_filter
+from scipy.ndimage import gaussian_filter1d
 
 from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import sample, sample_across
+from vinemap.rows.curtains import FAR, SOME, abreast, with_curtains
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
@@ -26,17 +27,6 @@ TAIL = 2.5
 """Standard deviations up to which the smoothing reaches."""
 SLICES = 3
 """Lines across the rows that are averaged in a slice."""
-SOME = 5
-"""Of so many nodes in either direction one is looked at for double curtains."""
-FAR = 2.0
-"""Spacings to both sides within which several curtains show."""
-PAIR, UNEVEN, DIP = 0.65, 0.15, 0.7
-"""Distance of a row's curtains in that to the next row's, share by which such distances may differ, and cover between
-two curtains in theirs, at the most."""
-AGREE = 0.07
-"""Share by which the distance of rows may differ from that of the field, or twice that."""
-AROUND, MOST = 8.0, 0.6
-"""Spacings, side of the square about a node, and share of what stands there in pairs, where rows have two curtains."""
 MERGED = 0.6
 """Standard deviation of the smoothing that leaves one maximum of two curtains, in their distance."""
 
@@ -83,35 +73,37 @@ def detect_key_points(
     -------
     GeoDataFrame
         PointZ with columns ``cover`` (0–1), ``direction_deg`` and ``spacing_m`` of the field there, and ``curtains_m``,
-        the distance of the two curtains of a row, 0 where it has one.
+        the distance of the two curtains of a row, 0 where it has one, and ``told``, whether gaps tell that.
     """
     nodes, cells = _nodes(field, cover.grid, grid_step, min_likelihood)
     some = nodes[(cells % SOME == SOME // 2).all(axis=1)]
 
-    def pairs(batch: Values) -> Values:
+    def curtains(batch: Values) -> Values:
         profile, offsets = _profiles(cover, batch, FAR * batch[:, 3].max(), slice_width, bin_width)
-        return _pairs(gaussian_filter1d(profile, smoothing / bin_width, axis=1), offsets, batch, min_cover)
+        profile = gaussian_filter1d(profile, smoothing / bin_width, axis=1)
+        return abreast(profile, offsets, batch, cover, min_cover=min_cover)
 
     def maxima(batch: Values) -> Values:
         # Beyond its reach a profile goes on for what the Gaussian needs.
-        curtains = float(batch[:, 4].max())
-        margin = TAIL * max(WIDE[-1] * smoothing, MERGED * curtains) + bin_width
+        double = float(batch[:, 4].max())
+        margin = TAIL * max(WIDE[-1] * smoothing, MERGED * double) + bin_width
         profile, offsets = _profiles(cover, batch, reach * batch[:, 3].max() + margin, slice_width, bin_width)
-        if curtains:
-            profile = gaussian_filter1d(profile, MERGED * curtains / bin_width, axis=1, truncate=TAIL)
+        if double:
+            profile = gaussian_filter1d(profile, MERGED * double / bin_width, axis=1, truncate=TAIL)
         else:
             profile = _smoothed(profile, offsets, batch[:, 3], smoothing)
         # What is laid together is spread, too.
-        return _maxima(profile, offsets, batch, reach, min_cover / 2 if curtains else min_cover)
+        return _maxima(profile, offsets, batch, reach, min_cover / 2 if double else min_cover)
 
-    found = np.concatenate([np.empty((0, 4)), *in_threads(pairs, _batches(some))])
-    nodes = _with_curtains(nodes, cells, found, grid_step)
+    found = np.concatenate([np.empty((0, 7)), *in_threads(curtains, _batches(some))])
+    nodes = with_curtains(nodes, cells, found, grid_step)
     double = nodes[:, 4] > 0
     batches = [*_batches(nodes[~double]), *_batches(nodes[double])]
-    points = np.concatenate([np.empty((0, 6)), *in_threads(maxima, batches)])
+    points = np.concatenate([np.empty((0, 7)), *in_threads(maxima, batches)])
     z = sample(dtm, points[:, :2]) if len(points) else np.empty(0)
     return gpd.GeoDataFrame(
-        dict(zip(("cover", "direction_deg", "spacing_m", "curtains_m"), points[:, 2:].T, strict=True)),
+        dict(zip(("cover", "direction_deg", "spacing_m", "curtains_m"), points[:, 2:6].T, strict=True))
+        | {"told": points[:, 6] > 0},
         geometry=gpd.points_from_xy(points[:, 0], points[:, 1], z),
         crs=cover.crs,
     )
@@ -172,7 +164,7 @@ def _smoothed(profile: Values, offsets: Values, spacing: Values, smoothing: floa
 
 
 def _maxima(profile: Values, offsets: Values, nodes: Values, reach: float, min_cover: float) -> Values:
-    """Maxima (m, 6) of the profiles: x, y, cover, direction (degrees), spacing and distance of curtains (m)."""
+    """Maxima (m, 7) of the profiles: x, y, cover, direction (degrees), and what else is known of their nodes (n, 6)."""
     middle = profile[:, 1:-1]
     peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
     peak &= np.abs(offsets[1:-1]) <= reach * nodes[:, 3:4]
@@ -182,50 +174,3 @@ def _maxima(profile: Values, offsets: Values, nodes: Values, reach: float, min_c
     v = offsets[k + 1] + (offsets[1] - offsets[0]) * np.clip(shift, -0.5, 0.5)
     xy = central_points(nodes[node, :2], v, nodes[node, 2])
     return np.column_stack([xy, top, np.degrees(nodes[node, 2]), nodes[node, 3:]])
-
-
-def _pairs(profile: Values, offsets: Values, nodes: Values, min_cover: float) -> Values:
-    """Nodes (m, 4) that show four curtains side by side: x, y, distance of two curtains of a row or 0, and of rows."""
-    middle = profile[:, 1:-1]
-    peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
-    node, k = np.nonzero(peak)
-    if len(node) < 4:
-        return np.empty((0, 4))
-    cover = middle[node, k]
-    between = np.minimum.reduceat(profile.ravel(), node * profile.shape[1] + k + 1)[:-1]
-    apart = (np.diff(node) == 0) & (between <= DIP * np.minimum(cover[:-1], cover[1:]))
-    gap = np.diff(offsets[k + 1])
-    first, second, third = gap[:-2], gap[1:-1], gap[2:]
-    outer = (first + third) / 2
-    less, more = np.minimum(outer, second), np.maximum(outer, second)
-    close = (less <= PAIR * more) & (np.abs(first - third) <= 2 * UNEVEN * outer)
-    # A row that is missing leaves three spacings, and tells nothing.
-    times = (less + more) / nodes[node[:-3], 3]
-    agree = np.minimum(np.abs(times - 1), np.abs(times / 2 - 1)) <= AGREE
-    shown = apart[:-2] & apart[1:-1] & apart[2:] & (agree | ~close)
-    out: Values = np.column_stack([nodes[node[:-3], :2], np.where(close, less, 0.0), less + more])[shown]
-    return out
-
-
-def _with_curtains(nodes: Values, cells: Ints, pairs: Values, step: float) -> Values:
-    """Nodes (n, 5): the same and the distance of a row's two curtains (m), 0 where most rows thereabouts have one.
-
-    Where rows have two, their spacing is that of the ``pairs`` (m, 4), which the field may take for one of curtains.
-    """
-    out = np.column_stack([nodes, np.zeros(len(nodes))])
-    close = pairs[:, 2] > 0
-    if not close.any():
-        return out
-    i, j = (cells // SOME).T
-    side = SOME * step
-    west, north = nodes[0, :2] + (cells[0, [1, 0]] + 0.5) * step * [-1, 1]
-    there = tuple(np.floor(np.column_stack([north - pairs[:, 1], pairs[:, 0] - west]) / side).astype(int).T)
-    counts = np.zeros((4, i.max() + 1, j.max() + 1))
-    what = np.ones(len(pairs)), close, pairs[:, 2], close * pairs[:, 3]
-    for count, values in zip(counts, what, strict=True):
-        np.add.at(count, there, values)
-    width = max(1, round(AROUND * float(np.median(nodes[:, 3])) / side))
-    some, double, metres, spacing = (uniform_filter(count, width, mode="constant")[i, j] for count in counts)
-    most = (double > MOST * some) & (double > 1e-9)
-    out[most, 4], out[most, 3] = metres[most] / double[most], spacing[most] / double[most]
-    return out

@@ -35,8 +35,14 @@ LOWER, BROADER, LONG = 0.75, 1.65, 2.0
 its length in its own widths."""
 BOTH_SIDES = 0.2
 """Share of its length along which a strip has rows on both sides at the least, as there are gaps in rows."""
-MOST = 0.6
-"""Share of what is lower than rows that strips of a cover crop are, where there are any."""
+NEXT = (1.8, 2.2)
+"""Half widths of an alley with a strip, from a row to the next one: between two curtains foliage is lower, too."""
+MOST, MUCH = 0.6, 0.1
+"""Share of what is lower than rows that strips of a cover crop are, where there are any, and its area in the rows'."""
+GRASS = 0.25
+"""Metres of height below which there is none."""
+ENOUGH = 32
+"""Points that tell how high something grows."""
 CORNERS = np.ones((3, 3))
 """What touches at a corner hangs together."""
 SOIL = 0.2
@@ -90,7 +96,7 @@ def heights_of_vines(
             cloud, chm = through, beneath
         else:
             ceiling[:] = np.inf
-    crops = _cover_crops(chm, high)
+    crops = _cover_crops(chm, high, cloud.size / max(1, int(np.count_nonzero(np.isfinite(chm.values)))))
     if crops.any():
         ceiling[crops] = SOIL
         cloud, chm = below()
@@ -118,21 +124,29 @@ def _in_cells(heights: Values, grid: Grid) -> Values:
     return out
 
 
-def _cover_crops(chm: Raster, high: float) -> Flags:
+def _cover_crops(chm: Raster, high: float, density: float) -> Flags:
     """Cells (ny, nx) of long strips that are lower and broader than the rows on both sides of them.
 
-    A row of young vines between old ones is lower, too, but no broader.
+    A row of young vines between old ones is lower, too, but no broader. Where most of what is lower is such strips, all
+    of it that is as broad is a cover crop, as at a block's edge. Where cells have so few points, on the mean, that one
+    shows a single stalk, and the next nothing, those about a cell tell what grows there.
     """
     top = _in_cells(height_about(chm, high), chm.grid)
     out: Flags = np.zeros(chm.grid.shape, dtype=bool)
     height = np.where(np.isnan(chm.values), maximum_filter(np.nan_to_num(chm.values), 3), chm.values)
-    vines = (top >= LOWEST) & (height >= LOWEST) & (height <= high)
+    vines = (top >= LOWEST) & (height >= GRASS) & (height <= high)
     tall = vines & (height >= LOWER * top)
-    low = binary_opening(vines & ~tall, CORNERS)
+    low = vines & ~tall
+    across = 2 * round((np.sqrt(ENOUGH / density) - 1) / 2) + 1
+    if across > 1:
+        # As many as a row has that is one cell wide.
+        tall &= _share(tall, across) > 0.9 / across
+        low = ~tall & (_share(vines & ~tall, across) > 0.5 * _share(~tall, across))
+    low = binary_opening(low, CORNERS)
     strips, width, length, depth = _parts(low)
     long = (length >= LONG * width) & (width >= BROADER)
     most = MOST * np.count_nonzero(low)
-    if not (low.any() and np.count_nonzero(long[strips] & low) >= most):
+    if np.count_nonzero(low) < MUCH * np.count_nonzero(tall) or np.count_nonzero(long[strips] & low) < most:
         return out
     rows, row_width, row_length, _ = _parts(tall)
     row = tall & (row_length >= LONG * row_width)[rows]  # and no post
@@ -141,14 +155,31 @@ def _cover_crops(chm: Raster, high: float) -> Flags:
     i, j = np.nonzero(low & (depth >= maximum_filter(depth, 3)))
     away, nearest = distance_transform_edt(~row, return_indices=True)
     a, b = nearest[:, i, j]
-    opposite = tuple(np.clip(2 * p - q, 0, n - 1) for p, q, n in zip((i, j), (a, b), low.shape, strict=True))
+    half, wide = away[i, j], row_width[rows[a, b]]
+
+    def a_row_stands(across: Values) -> Flags:
+        """Whether a row stands so many cells across the row beside a strip."""
+        there = ((q + across * (q - p) / half).round().astype(int) for p, q in zip((i, j), (a, b), strict=True))
+        at = tuple(np.clip(k, 0, n - 1) for k, n in zip(there, low.shape, strict=True))
+        out: Flags = away[at] <= 0.5 * half
+        return out
+
     strip, beside = strips[i, j], row_width[rows[a, b]]
     n = np.maximum(np.bincount(strip, minlength=len(width)), 1)
-    between = np.bincount(strip, away[opposite] <= 0.5 * away[i, j], minlength=len(width)) / n
+    among = a_row_stands(-2 * half) & np.any([a_row_stands(wide + n * half) for n in NEXT], axis=0)
+    between = np.bincount(strip, among, minlength=len(width)) / n
     broader = width >= BROADER * np.bincount(strip, beside, minlength=len(width)) / n
     crops = (long & broader & (between >= BOTH_SIDES))[strips] & low
     if np.count_nonzero(crops) >= most:
-        out = binary_dilation(crops, CORNERS) & ~tall
+        out = low & broader[strips]
+        if across == 1:  # what was opened lacks its edges
+            out = binary_dilation(out, CORNERS) & ~tall
+    return out
+
+
+def _share(mask: Flags, across: int) -> Values:
+    """Share (ny, nx) of the cells in squares of so many across."""
+    out: Values = uniform_filter(mask.astype(np.float32), across)
     return out
 
 

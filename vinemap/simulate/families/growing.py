@@ -69,11 +69,28 @@ def strips(rng: np.random.Generator) -> Survey:
     return survey_of(rng, rows, canopy=vines, beside=[crop])
 
 
+def cover_crop(rng: np.random.Generator) -> Survey:
+    """A cover crop of half a metre and more in every alley or every other one, seen by few points that half pass it."""
+    n, spacing, azimuth, length = 8, rng.uniform(2.2, 2.6), rng.uniform(0, 180), rng.uniform(30, 40)
+    rows = rows_of(n, length=length, spacing=spacing, azimuth=azimuth)
+    alleys = rows_of(n - 1, length=length, spacing=spacing, azimuth=azimuth)[:: rng.integers(1, 3)]
+    sown: dict[str, Any] = {"height": rng.uniform(0.5, 0.7), "half_width": rng.uniform(0.5, 0.7), "leafiness": 2.0}
+    crop = Vineyard("", alleys, bottom=0.0, dead=0.03, **sown)
+    return survey_of(rng, rows, beside=[crop], weeds=0.1, density=rng.uniform(80, 120))
+
+
 def double(rng: np.random.Generator) -> Survey:
     """Geneva double curtain: two curtains hang about a metre apart over one line of trunks."""
     rows = block(rng, n=6, spacing=rng.uniform(3.6, 4.2))
     curtains = {"curtains": rng.uniform(0.9, 1.2), "height": rng.uniform(1.5, 1.8), "bottom": 0.8}
     return survey_of(rng, rows, canopy=curtains | {"half_width": rng.uniform(0.2, 0.3)}, obstacles=posts(rows, top=1.7))
+
+
+def double_slim(rng: np.random.Generator) -> Survey:
+    """Two slim curtains a third of the rows' spacing apart, or somewhat more, over posts that aren't seen."""
+    spacing = rng.uniform(3.4, 4.2)
+    curtains = {"curtains": spacing * rng.uniform(0.3, 0.4), "height": rng.uniform(1.5, 1.8), "bottom": 0.8}
+    return survey_of(rng, block(rng, n=6, spacing=spacing), canopy=curtains | {"half_width": rng.uniform(0.13, 0.2)})
 
 
 def sprawl(rng: np.random.Generator) -> Survey:
