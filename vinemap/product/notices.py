@@ -51,7 +51,7 @@ MOST_TALL = 0.3
 BESIDE, PARALLEL = 3.0, 0.95
 """Spacings within which rows stand beside each other, and cosine of the angle between them."""
 WIDEST, ALIKE, PAIRED = 1.8, 0.15, 0.5
-"""Metres between two curtains of a row, at the most, share by which pairs' distances may differ, and of rows in pairs."""
+"""Metres between two curtains of a row, at the most, share by which pairs' distances differ, and of rows in pairs."""
 MAIN = 0.1
 """Share of what is in no row from which a reason is worth to be told."""
 

@@ -153,8 +153,8 @@ def curtain_remarks(courses: gpd.GeoDataFrame) -> list[str]:
         return []
     apart = guessed["curtains_m"].median()
     remark = (
-        f"{len(guessed)} rows are taken for such of two curtains, {apart:.1f} m apart, by their distances alone: if they "
-        "are two rows each, known rows tell it (--rows)"
+        f"{len(guessed)} rows are taken for such of two curtains, {apart:.1f} m apart, by their distances alone: if "
+        "they are two rows each, known rows tell it (--rows)"
     )
     return [remark]
 
