@@ -29,9 +29,11 @@ def rows_of(heights, widths=0.5, block=1, apart=2.5):
     return gpd.GeoDataFrame(table | {"height_m": heights, "width_m": widths}, geometry=lines, crs=32632)
 
 
-def sections_of(n=N, seen=0.9, width=0.5, row_id=1, extent=0.4):
+def sections_of(n=N, seen=0.9, width=0.5, row_id=1, extent=0.4, full=1.0):
     sizes = {"width_m": np.broadcast_to(width, n), "area_m2": 1.2 * np.broadcast_to(width, n)}
-    return pd.DataFrame({"row_id": row_id, "position_m": STEP * np.arange(n), "seen": seen, "extent_m": extent} | sizes)
+    return pd.DataFrame(
+        {"row_id": row_id, "position_m": STEP * np.arange(n), "seen": seen, "full": full, "extent_m": extent} | sizes
+    )
 
 
 def confidence(sections, **columns):
@@ -49,6 +51,8 @@ def test_what_was_not_modelled_not_seen_or_does_not_agree_is_doubtful():
     assert confidence(sections_of(n=N // 2), gap_m=LENGTH / 4, unseen_m=LENGTH / 4) == pytest.approx(1, abs=0.03)
     assert confidence(sections_of(), cut=0.7) == pytest.approx(0.3, abs=0.01)
     assert confidence(sections_of(seen=0.55)) == pytest.approx(2 / 7)
+    assert confidence(sections_of(full=0.4)) == 0  # two curtains, and air between them
+    assert confidence(sections_of(full=0.9)) == pytest.approx(1)
     assert confidence(sections_of(width=jagged)) < 0.5
     assert confidence(sections_of(n=3), gap_m=LENGTH - 1) == 0
     assert confidence(sections_of(width=2.2), width_m=2.2) < 0.6

@@ -27,9 +27,11 @@ HECTARE = 10_000.0
 LOW, HIGH, TOP = 0.02, 0.98, 0.985
 """Quantiles of the canopy's points across the row, its sides, and of their heights, its top."""
 CELL = 0.1
-"""Metres of height, on one side of a canopy, that a point shows."""
+"""Metres of height, on one side of a canopy, and across it, that a point shows."""
 SEEN = 0.45, 0.8
 """Shares of such cells that are shown where a canopy's numbers are to be doubted, and where they aren't."""
+FULL = 0.6, 0.85
+"""Shares of a canopy's width that hold foliage where its numbers are to be doubted, as with two curtains, or aren't."""
 DIFFERENT = 0.25, 0.14
 """Shares by which sections a metre apart differ, where their numbers are to be doubted, and where they aren't."""
 SPREADING = 2.5, 0.8
@@ -63,6 +65,8 @@ class Measures(NamedTuple):
     """R (m,) of Table 3.1."""
     seen: Values
     """Share (m,) of both sides, from the lowest points up to the height, on which there are points."""
+    full: Values
+    """Share (m,) of the width on which there are points."""
 
 
 def measure_sections(canopy: Sections, bottom: Values, areas: tuple[Values, Values, Values], *, c: int) -> Measures:
@@ -83,8 +87,8 @@ def measure_sections(canopy: Sections, bottom: Values, areas: tuple[Values, Valu
     height = quantile_of(canopy.height, canopy.start, TOP)
     indices = *modelling_indices(*areas), complexity_reduction(canopy, c=c)
     lowest = quantile_of(canopy.height, canopy.start, LOW)
-    seen = _seen(canopy.points, canopy.height, canopy.start, (left + right) / 2, lowest, height)
-    return Measures(np.diff(canopy.start), height, bottom, left - right, areas[2], *indices, seen)
+    shown = _shown(canopy.points, canopy.height, canopy.start, (right, left), (lowest, height))
+    return Measures(np.diff(canopy.start), height, bottom, left - right, areas[2], *indices, *shown)
 
 
 def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs: CRS) -> gpd.GeoDataFrame:
@@ -106,10 +110,10 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
         ``width_m`` (2–98% across), ``area_m2`` (the foliage's), ``n_points`` and the ``extent_m`` along the row from
         which they are; tree-row volume ``trv_m3_ha`` = height ·
         width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha`` = 2 (height − bottom) · 10,000 / spacing; Table 3.1's
-        indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``,
-        the share of both sides on which there are points.
+        indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``
+        and ``full``, the shares of both sides, and of the width, on which there are points.
     """
-    n_points, height, bottom, width, area, good, under, over, reduction, seen = measures
+    n_points, height, bottom, width, area, good, under, over, reduction, seen, full = measures
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
     ends = at.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
@@ -132,6 +136,7 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
             "reduction": reduction,
             "quality": good - (under + over) + reduction,
             "seen": seen,
+            "full": full,
         },
         geometry=shapely.linestrings(np.concatenate([ends, level], axis=2)) if len(ends) else [],
         crs=crs,
@@ -175,20 +180,23 @@ def _in_the_one_before(member: NDArray[np.int32], start: Ints, row_id: Ints) -> 
 
 
 @compiled
-def _seen(points: Values, heights: Values, start: Ints, middle: Values, bottom: Values, top: Values) -> Values:
-    """Share (m,) of cells of height on both sides of sections' middles, from bottom to top, that have points."""
-    out = np.zeros(len(middle))
-    for k in range(len(middle)):
+def _shown(
+    points: Values, heights: Values, start: Ints, sides: tuple[Values, Values], ends: tuple[Values, Values]
+) -> tuple[Values, Values]:
+    """Shares (m,) of cells that have points: of height on both sides, between ends; and across, between sides."""
+    (right, left), (bottom, top) = sides, ends
+    seen, full = np.zeros(len(right)), np.zeros(len(right))
+    for k in range(len(right)):
         n = max(math.ceil((top[k] - bottom[k]) / CELL), 1)
-        shown, cells = np.zeros((2, n)), 0
+        m = max(math.ceil((left[k] - right[k]) / CELL), 1)
+        beside, across = np.zeros((2, n)), np.zeros(m)
         for p in range(start[k], start[k + 1]):
             i = int((heights[p] - bottom[k]) / CELL)
             if 0 <= i < n and heights[p] >= bottom[k]:
-                side = int(points[p, 0] > middle[k])
-                cells += shown[side, i] == 0
-                shown[side, i] = 1
-        out[k] = cells / (2 * n)
-    return out
+                beside[int(2 * points[p, 0] > left[k] + right[k]), i] = 1
+            across[min(max(int((points[p, 0] - right[k]) / CELL), 0), m - 1)] = 1
+        seen[k], full[k] = beside.sum() / (2 * n), across.sum() / m
+    return seen, full
 
 
 def quantile_of(values: Values, start: Ints, q: float) -> Values:
@@ -241,12 +249,13 @@ def lengths_of(sections: gpd.GeoDataFrame, step: float) -> Values:
 def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
     """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
 
-    The confidence, from 0 to 1, is the product of six shares: of the row's length without its gaps that has sections;
+    The confidence, from 0 to 1, is the product of seven shares: of the row's length without its gaps that has sections;
     of the canopy that isn't cut at a side; of the canopy that was seen, on both sides from its lowest points to its
-    top; of the underside that isn't hidden, as it is where a canopy is wider than deep; of what stands above
-    weeds, where it is low; and of the agreement in width and area of sections a metre apart, or as far as they share
-    no point, in which canopies of one row don't differ much. Flagged are heights and widths whose ratio to the median
-    of their block, or of the rows around one that is of no block, is odd, if rows there don't differ anyway.
+    top; of its width that holds foliage, and no air between two curtains; of the underside that isn't hidden, as it is
+    where a canopy is wider than deep; of what stands above weeds, where it is low; and of the agreement in width and
+    area of sections a metre apart, or as far as they share no point, in which canopies of one row don't differ much.
+    Flagged are heights and widths whose ratio to the median of their block, or of the rows around one that is of no
+    block, is odd, if rows there don't differ anyway.
 
     Parameters
     ----------
@@ -265,11 +274,12 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
         {
             "modelled": pd.Series(lengths_of(sections, step)).groupby(row).sum(),
             "seen": sections.groupby("row_id")["seen"].mean(),
+            "full": sections.groupby("row_id")["full"].mean(),
             "difference": _difference(sections, step=step),
         }
     ).reindex(rows["row_id"])
     confidence = np.minimum(table["modelled"].to_numpy() / canopy, 1) * _between(table["seen"].to_numpy(), SEEN)
-    confidence *= 1 - cut
+    confidence *= (1 - cut) * _between(table["full"].to_numpy(), FULL)
     confidence *= _between(table["difference"].to_numpy(), DIFFERENT)
     height, bottom, width = (rows[f"{name}_m"].to_numpy(dtype=float) for name in ("height", "bottom", "width"))
     confidence *= _between(width / np.maximum(height - bottom, CELL), SPREADING)
