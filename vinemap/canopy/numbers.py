@@ -189,13 +189,16 @@ def _shown(
     for k in range(len(right)):
         n = max(math.ceil((top[k] - bottom[k]) / CELL), 1)
         m = max(math.ceil((left[k] - right[k]) / CELL), 1)
-        beside, across = np.zeros((2, n)), np.zeros(m)
+        beside, across = np.zeros(2 * n), np.zeros(m)
         for p in range(start[k], start[k + 1]):
             i = int((heights[p] - bottom[k]) / CELL)
             if 0 <= i < n and heights[p] >= bottom[k]:
-                beside[int(2 * points[p, 0] > left[k] + right[k]), i] = 1
-            across[min(max(int((points[p, 0] - right[k]) / CELL), 0), m - 1)] = 1
-        seen[k], full[k] = beside.sum() / (2 * n), across.sum() / m
+                cell = 2 * i + int(2 * points[p, 0] > left[k] + right[k])
+                seen[k] += (1 - beside[cell]) / (2 * n)
+                beside[cell] = 1
+            j = min(max(int((points[p, 0] - right[k]) / CELL), 0), m - 1)
+            full[k] += (1 - across[j]) / m
+            across[j] = 1
     return seen, full
 
 

@@ -231,7 +231,7 @@ def _aspect(at: _Stations, chm: Raster, normal: Values, usual: Values) -> Values
     if len(known) == 0:
         return out
     wide = normal[known] * usual[known, None]
-    heights = sample_across(chm, at.xy[known], wide, offsets)
+    heights = sample(chm, at.xy[known, None] + offsets[:, None] * wide[:, None])
     top = np.where(np.isfinite(heights[:, 5:12]), heights[:, 5:12], -np.inf).max(axis=1)
     top = np.where(np.isfinite(top), top, np.nan)
     height = at.median(pd.Series(top, index=known).reindex(np.arange(len(at.row))).to_numpy())

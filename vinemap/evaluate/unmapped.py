@@ -111,7 +111,7 @@ def _coarse(chm: Raster) -> Raster:
     if n == 1:
         return chm
     known = np.isfinite(chm.values)
-    count = block_sum(known.astype(np.uint8), n)
+    count = block_sum(known, n)
     mean = block_sum(np.where(known, chm.values, 0.0), n) / np.where(count > 0, count, np.nan)
     return Raster(mean, coarser(chm.grid, resolution=n * chm.grid.resolution), chm.crs)
 

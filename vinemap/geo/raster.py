@@ -152,11 +152,12 @@ def _lines_in(coarse: Grid, fine: Grid) -> tuple[NDArray[np.int64], NDArray[np.i
     return i, j
 
 
-def block_sum(values: NDArray[np.floating] | NDArray[np.integer], k: int) -> NDArray[np.float64]:
-    """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)); beyond the edge there is nothing."""
+def block_sum(values: NDArray[np.floating] | NDArray[np.uint16] | NDArray[np.bool_], k: int) -> NDArray[np.float64]:
+    """Sums over blocks of k x k cells, (ceil(ny / k), ceil(nx / k)), or flags in them; beyond the edge is nothing."""
     ny, nx = (-(-n // k) for n in values.shape)
     out = np.zeros((ny, nx))
-    in_threads(lambda part: _block_sums(*part, values, k, out), stretches(ny))
+    cells = values.astype(np.uint16) if values.dtype == bool else values
+    in_threads(lambda part: _block_sums(*part, cells, k, out), stretches(ny))
     return out
 
 
@@ -194,9 +195,7 @@ def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 @compiled
-def _block_sums(
-    first: int, last: int, values: NDArray[np.floating] | NDArray[np.integer], k: int, out: NDArray[np.float64]
-) -> None:
+def _block_sums(first: int, last: int, values: NDArray[np.generic], k: int, out: NDArray[np.float64]) -> None:
     for i in range(first * k, min(last * k, values.shape[0])):
         for j in range(values.shape[1]):
             out[i // k, j // k] += values[i, j]

@@ -76,7 +76,7 @@ def notices(
         Number of points.
     """
     n = max(1, round(SIDE / chm.grid.resolution))
-    seen = block_sum(np.isfinite(chm.values).astype(np.uint16), n) > 0
+    seen = block_sum(np.isfinite(chm.values), n) > 0
     side = n * chm.grid.resolution
     polygon = shapely.union_all(parcel.geometry.to_numpy())
     covered = _covered(polygon, seen, chm.grid, side)

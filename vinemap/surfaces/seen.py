@@ -14,8 +14,6 @@ from vinemap.geo.curve import across, resample, way_along
 from vinemap.geo.raster import Grid, block_sum, cell_of, spread
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Flags, Values
 
@@ -78,7 +76,7 @@ def seen_cells(cloud: Cloud, grid: Grid) -> Seen:
     grid : Grid
         Over the cloud; its cells are the smallest that are tried.
     """
-    shown = np.zeros(grid.shape, dtype=np.uint8)
+    shown = np.zeros(grid.shape, dtype=bool)
     for part in cloud.parts():
         in_threads(partial(_show, shown.ravel(), part.xyz, grid), stretches(part.size))
     widest = 0
@@ -94,7 +92,7 @@ def seen_cells(cloud: Cloud, grid: Grid) -> Seen:
     fine = Grid(
         grid.west - grid.resolution, grid.north + grid.resolution, grid.resolution, *(n + 2 for n in grid.shape)
     )
-    return Seen(~_holes(cells), around, np.pad(shown, 1).astype(bool), fine)
+    return Seen(~_holes(cells), around, np.pad(shown, 1), fine)
 
 
 def _holes(shown: Flags) -> Flags:
@@ -108,13 +106,13 @@ def _holes(shown: Flags) -> Flags:
     return out
 
 
-def _show(shown: NDArray[np.uint8], xyz: Values, grid: Grid, some: tuple[int, int]) -> None:
+def _show(shown: Flags, xyz: Values, grid: Grid, some: tuple[int, int]) -> None:
     """Mark the cells of a grid, one after the other, in which some of the points (n, 3) lie."""
-    shown[cell_of(xyz[slice(*some)], grid)] = 1
+    shown[cell_of(xyz[slice(*some)], grid)] = True
 
 
 def _usual(shown: Flags) -> bool:
     """Whether holes are usual in squares of cells that lie amid such as hold points."""
-    points, holes = (block_sum(cells.view(np.uint8), SQUARE) > 0 for cells in (shown, _holes(shown)))
+    points, holes = (block_sum(cells, SQUARE) > 0 for cells in (shown, _holes(shown)))
     amid = binary_erosion(points, np.ones((3, 3)))
     return bool(amid.any() and holes[amid].mean() > USUAL)

@@ -156,7 +156,7 @@ def canopy_picture(chm: Raster) -> tuple[bytes, float, float]:
 
     n = -(-max(chm.grid.shape) // LARGEST)
     known = np.isfinite(chm.values)
-    count = block_sum(known.astype(float), n)
+    count = block_sum(known, n)
     mean = block_sum(np.where(known, chm.values, 0.0), n) / np.maximum(count, 1)
     shade = np.rint(np.clip(mean / TALLEST, 0, 1) * (SHADES - 1))
     levels = np.where(count > 0, shade + 1, 0).astype(np.uint8)
