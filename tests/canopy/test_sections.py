@@ -181,6 +181,15 @@ def test_canopies_of_lidar_are_as_large_as_those_of_a_dense_cloud(vineyard, clou
     assert np.abs(sparse["width_m"] - truth["mean_width"]).max() < 0.15
 
 
+def test_canopies_end_where_the_cover_does():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(0, 20, 6000), rng.normal(30, 0.1, 6000), rng.uniform(1, 4.6, 6000)])
+    cloud, line = PointCloud(wall, UTM, heights=wall[:, 2]), rows_frame([[(0, 30), (20, 30)]])
+    for high, height in ((3.6, 3.6), (5.5, 4.6)):
+        found = find_canopies(cloud, line, gaps_frame(), flat(0, 0), Settings(cover={"high": high}))
+        assert model_sections(found, UTM).table["height_m"].median() == pytest.approx(height, abs=0.1)
+
+
 def test_quantile_of_each_section():
     rng = np.random.default_rng(0)
     n = np.array([1, 0, 5, 100, 2])

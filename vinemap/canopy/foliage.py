@@ -50,7 +50,7 @@ def separate_canopy(
     *,
     margin: float = 0.4,
     half_width: float | None = None,
-    max_height: float = 3.6,
+    high: float = 3.6,
     min_neighbours: float = 0.02,
     min_height: float = 0.8,
 ) -> Canopy:
@@ -68,7 +68,7 @@ def separate_canopy(
         Metres above plane and terrain at which canopy begins, or less where the row is low.
     half_width : float, optional
         Metres to the side of γ at which canopy ends; by default what holds the row's, half its spacing at the most.
-    max_height : float
+    high : float
         Metres above terrain at which canopy ends.
     min_neighbours : float
         Share of a section's canopy points that must lie around a point (in 3 x 3 cells of 0.1 m), or it is noise; less
@@ -76,17 +76,17 @@ def separate_canopy(
     min_height : float
         Metres from which points are high, or less where the row is low.
     """
-    m, top = len(sections.row_id), max_height
+    m, top = len(sections.row_id), high
     if m:
         spacing = float(sections.spacing.max())
         across = sections.points[:, 0].copy()
-        top, half = canopy_size(across, sections.height, spacing, max_height)
+        top, half = canopy_size(across, sections.height, spacing, high)
         half_width = half if half_width is None else half_width
         floor = canopy_floor(across, sections.height, (top, half), spacing)
         margin, min_height = min(margin, floor), min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
-    limits = (margin, half_width or 0.0, max_height, min_neighbours, min_height, top)
+    limits = (margin, half_width or 0.0, high, min_neighbours, min_height, top)
     in_threads(
         lambda part: _separate(*part, sections.start, sections.points, sections.height, limits, keep, walls, tall),
         stretches(m),
@@ -133,12 +133,12 @@ def _separate(
     tall: Values,
 ) -> None:
     """Flag the canopy's points of sections; write wall w and level h of both sides, and the share of high points."""
-    margin, half_width, max_height, share, min_height, top = limits
+    margin, half_width, high, share, min_height, top = limits
     for k in range(first, last):
         mine = slice(start[k], start[k + 1])
         y, z, up, kept = points[mine, 0], points[mine, 1], height[mine], keep[mine]
         for p in range(len(y)):
-            kept[p] = margin <= up[p] <= max_height and abs(y[p]) <= half_width
+            kept[p] = margin <= up[p] <= high and abs(y[p]) <= half_width
         if _sticks_out(y, up, kept, STICKING * top):
             for p in range(len(y)):
                 kept[p] = kept[p] and up[p] <= top

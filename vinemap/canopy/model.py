@@ -68,7 +68,7 @@ def find_canopies(
     options |= {"low": settings.cover.low, "high": settings.cover.high}
     separate = settings.canopy.model_dump()
     living = {name: separate.pop(name) for name in ("min_points", "min_share")}
-    canopies = cut_sections(cloud, rows, gaps, dtm, partial(separate_canopy, **separate), **options)
+    canopies = cut_sections(cloud, rows, gaps, dtm, partial(separate_canopy, **separate, high=options["high"]), **options)
     return living_canopies(canopies, **living)
 
 

@@ -83,7 +83,7 @@ class CoverOptions(Options):
 
     resolution: float = Field(0.1, ge=0.02, le=0.5, description="cell size (m)")
     low: Metres = Field(0.5, description="height above ground at which canopy begins, or less where all is low (m)")
-    high: Metres = Field(3.6, description="height above ground at which it ends (m)")
+    high: Metres = Field(3.6, description="height above ground at which it ends, and vines do (m)")
     smoothing: float | None = Field(None, gt=0, le=1, description="Gaussian (m); none: the mean point distance")
 
     @model_validator(mode="after")
@@ -196,17 +196,10 @@ class CanopyOptions(Options):
     half_width: float | None = Field(
         None, gt=0, le=100, description="distance from γ at which canopy ends (m); none: what holds the row's"
     )
-    max_height: Metres = Field(3.6, description="height above terrain at which canopy ends (m)")
     min_neighbours: Share = Field(0.02, description="share of a section's points around a point that isn't noise")
     min_points: int = Field(8, ge=3, description="canopy points of a section")
     min_share: Share = Field(0.15, description="share of the median section's points that a section has")
     min_height: float = Field(0.8, ge=0, le=5, description="height of a section's highest tenth, less in low rows (m)")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> CanopyOptions:
-        if max(self.margin, self.min_height) >= self.max_height:
-            raise ValueError(f"max_height ({self.max_height}) must be above margin and min_height")
-        return self
 
 
 class PolygonOptions(Options):
