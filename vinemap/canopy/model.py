@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -64,11 +64,11 @@ def find_canopies(
     settings : Settings
         Of sections, canopy and the heights of the cover.
     """
-    options: dict[str, Any] = settings.sections.model_dump()
-    options |= {"low": settings.cover.low, "high": settings.cover.high}
-    separate = settings.canopy.model_dump()
-    living = {name: separate.pop(name) for name in ("min_points", "min_share")}
-    canopies = cut_sections(cloud, rows, gaps, dtm, partial(separate_canopy, **separate, high=options["high"]), **options)
+    low, high = settings.cover.low, settings.cover.high
+    options = settings.canopy.model_dump()
+    living = {name: options.pop(name) for name in ("min_points", "min_share")}
+    separate = partial(separate_canopy, high=high, **options)
+    canopies = cut_sections(cloud, rows, gaps, dtm, separate, low=low, high=high, **settings.sections.model_dump())
     return living_canopies(canopies, **living)
 
 
