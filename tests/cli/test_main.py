@@ -33,8 +33,8 @@ def test_run_and_evaluate(tmp_path, survey):
     assert done.stdout.startswith("A: 6 rows, ")
     folder = tmp_path / "data" / "products" / "small" / "A"
     assert (folder / "run.json").is_file()
-    done = vinemap("evaluate", folder / "A.gpkg", truth, "--pairs", "pairs.gpkg", cwd=tmp_path)
-    assert len(gpd.read_file(tmp_path / "pairs.gpkg", layer="pairs")) == 6
+    done = vinemap("evaluate", folder / "A.gpkg", truth, "--pairs", "new/pairs.gpkg", cwd=tmp_path)
+    assert len(gpd.read_file(tmp_path / "new" / "pairs.gpkg", layer="pairs")) == 6
     assert done.returncode == 0
     assert "good 100.0%, extra 0.0%, missed 0.0%" in done.stdout
 

@@ -110,6 +110,7 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     """
     draft = paths.draft(path, ".gpkg")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with _gdal(**WITHOUT_LOCKS):
             pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
         draft.replace(path)
