@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 
-@click.command()
+@click.command(short_help="Print a configuration file with every key.")
 @click.argument("kind", type=click.Choice(["estate", "survey", "settings", "camera"]), default="estate")
 def config(kind: str) -> None:
     """Print all that can be configured, with its defaults, as a commented YAML file.

@@ -20,7 +20,7 @@ VARIABLES = ("NUMBA_CACHE_DIR", "PROJ_DATA", "GDAL_DATA", "PYTHONPATH")
 """Of the environment, which decide where things are found."""
 
 
-@click.command()
+@click.command(short_help="Tell of this installation on one page.")
 def doctor() -> None:
     """Tell of this installation on one page, to paste into a report of a fault: versions, what is missing, folders.
 

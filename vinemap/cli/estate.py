@@ -37,7 +37,7 @@ def flows(name: str) -> Any:
     return import_module(f"{package}.{name}")
 
 
-@click.command()
+@click.command(short_help="Make the example survey in this folder.")
 def example() -> None:
     """Make the example in this folder: configs/barolo.yaml, and a simulated survey whose true rows are known."""
     from vinemap.example import write_example
@@ -47,7 +47,7 @@ def example() -> None:
     click.echo("vinemap parcel F maps its parcel F, vinemap survey barolo all of them")
 
 
-@click.command()
+@click.command(short_help="Map one parcel of a configured survey.")
 @click.argument("parcel")
 @click.option("--config", type=FILE, default=paths.EXAMPLE, help="Configuration; configs/barolo.yaml by default.")
 def parcel(parcel: str, config: Path) -> None:
@@ -67,7 +67,7 @@ def parcel(parcel: str, config: Path) -> None:
     click.echo(summary.line())
 
 
-@click.command()
+@click.command(short_help="Map the surveys that arrive, on a schedule.")
 @click.option("--config", type=FILE, default=paths.ESTATE, help="The estate's; configs/nightly.yaml by default.")
 @click.option("--once", is_flag=True, help="Map what needs it now, and end; exit code 1 if a survey fails.")
 @click.option("--every", type=click.FloatRange(1), help="Seconds from run to run, instead of the configuration's cron.")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@click.command()
+@click.command(short_help="Compare rows with reference lines.")
 @click.argument("result", type=FILE)
 @click.argument("reference", type=FILE)
 @click.option("--layer", help="Layer of REFERENCE; rows, or its only layer of lines, by default.")

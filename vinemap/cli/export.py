@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@click.command()
+@click.command(short_help="Write rows, lanes, canopies for other programs.")
 @click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
 @click.option(
     "--format",
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 @click.option("--grid", is_flag=True, help="Robots' coordinates and meshes in the product's CRS; in {Main} by default.")
 @click.option("--vertices", type=click.IntRange(2, 10_000), help="Vertices of every lane; by default few.")
 def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | None, **options: Any) -> None:
-    """Write the rows of each PRODUCT (its folder or GeoPackage, or that of a survey), and lanes between them."""
+    """Write rows, lanes, canopies and tables of each PRODUCT (its folder or GeoPackage, or a survey's) for others."""
     from vinemap import paths
     from vinemap.export.write import export_products
 
@@ -42,7 +42,7 @@ def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | Non
         click.echo(line)
 
 
-@click.command()
+@click.command(short_help="Show cloud, rows and meshes in 3D.")
 @click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
 @click.option("--cloud", type=FILE, help="Points to show; by default the product's classified cloud, if it has one.")
 @click.option("--png", type=FILE, help="Picture to write instead of opening a window; needed where there is no screen.")

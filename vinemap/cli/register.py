@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@click.command()
+@click.command(short_help="Put the rows of products into the register.")
 @click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
 @click.option("--register", "path", type=FILE, help="The register; data/register.gpkg by default.")
 @click.option("--add", "how", flag_value="add", help="Take in rows that the register lacks where it has others, too.")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@click.command()
+@click.command(short_help="Map the rows and canopies of one parcel.")
 @click.argument("clouds", metavar="CLOUD...", nargs=-1, required=True, type=FILE)
 @click.option(
     "--boundary",

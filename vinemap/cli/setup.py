@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@click.command()
+@click.command(short_help="Compile ahead what is slow in Python.")
 def warm() -> None:
     """Compile what is slow in Python and keep it, as the first run would; at once where that is done."""
     from vinemap import warm
@@ -21,7 +21,7 @@ def warm() -> None:
     click.echo(warm.warm().line())
 
 
-@click.command("qgis-plugin")
+@click.command("qgis-plugin", short_help="Write the plugin for QGIS.")
 @click.option("--zip", "packed", type=FILE, help="File to write, for Install from ZIP; vinemap_qgis.zip by default.")
 @click.option("--install", is_flag=True, help="Put it into your profile of QGIS instead.")
 @click.option("--profile", help="Which profile; default by default.")

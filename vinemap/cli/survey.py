@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 GIVEN = {ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT}
 
 
-@click.command()
+@click.command(short_help="Map many parcels of a survey in one job.")
 @click.argument("clouds", metavar="CLOUD... | NAME", nargs=-1, required=True, type=FILE)
 @click.option("--boundaries", type=FILE, help="Polygons of the parcels of CLOUD, named in one of their columns.")
 @click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")

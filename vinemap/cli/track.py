@@ -17,7 +17,7 @@ SHARE = click.FloatRange(0, 0.8, min_open=True)
 METHODS = ("aligned", "quadratic", "centroid", "maximum")
 
 
-@click.command()
+@click.command(short_help="Follow a robot by the frames of its camera.")
 @click.argument("frames", nargs=-1, required=True, type=FILE)
 @click.option("--camera", type=FILE, required=True, help="YAML file of the camera: see vinemap config camera.")
 @click.option("--out", type=FILE, default=paths.TRACK, help="GeoPackage to write; track.gpkg by default.")
