@@ -23,11 +23,18 @@ def text(name):
     return (ROOT / "docs" / name).read_text(encoding="utf-8")
 
 
+def headings(page):
+    """Names by which links may call the headings of a page."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
-    missing = [link for link in links if ":" not in link and not (page.parent / link).exists()]
-    assert missing == []
+    links = re.findall(r"\]\(([^)#\s]*)(?:#([^)]*))?\)", page.read_text(encoding="utf-8"))
+    within = [(page.parent / link if link else page, heading) for link, heading in links if ":" not in link]
+    assert [path for path, _ in within if not path.exists()] == []
+    assert [(path.name, heading) for path, heading in within if heading and heading not in headings(path)] == []
 
 
 def test_every_page_is_reached_from_the_readme():

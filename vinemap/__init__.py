@@ -3,11 +3,13 @@
 What a notebook needs is here and loaded at its first use; everything else is imported from its room, as
 ``from vinemap.canopy.mesh import section_meshes``. A room may use those above it in this list, never those below::
 
-    errors, paths                 one root exception; the only place where a file's name is written
+    errors, naming, paths         one root exception; names of files, as any system takes them; where files lie
     compute, geo, config, cloud   threads and compiled loops; places; settings; points
     surfaces, rows, canopy        chapters 2 and 3 of the thesis, a stage a file
     evaluate, product, odometry   how good a map is; what a run leaves; chapter 4
-    export, parcel, jobs          other programs' formats; the chain, once; many parcels and surveys
+    export, view                  other programs' formats; cloud, rows and meshes on a screen
+    stages, chain, making         the stages' names; rows and canopies of a cloud; a product of them
+    parcel, warm, jobs            a parcel, once; loops compiled ahead; many parcels and surveys
     plugin                        what calls vinemap from QGIS, and puts it there
     terminal, simulate, example   what people see in one; vineyards of known truth; that which comes with vinemap
     flows, cli, measure           the chain as flows of Prefect; the command line; accuracy and speed

@@ -40,7 +40,7 @@ def frame_progress(frames: Iterable[T], count: int | None) -> Iterator[T]:
 def progress(parcel: str) -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that moves a bar and names the stage, on stderr.
 
-    With ``VINEMAP_PROGRESS=1`` it writes a line a stage instead (``5/14 Key points``), for programs that show it
+    With ``VINEMAP_PROGRESS=1`` it writes a line a stage instead (``4/14 Key points``), for programs that show it
     themselves.
     """
     if os.environ.get("VINEMAP_PROGRESS"):

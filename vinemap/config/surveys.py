@@ -99,7 +99,10 @@ class _Surveys(Options):
 class SurveyConfig(_Surveys):
     """A survey: its cloud, its parcels and the settings for all of them."""
 
-    survey: Name = Field(description="name; its data lie in data/surveys/<survey>")
+    survey: Name = Field(
+        examples=["survey"],
+        description="name, and where its data lie: data/surveys/<survey>; not needed in a survey.yaml there",
+    )
     cloud: Path | list[Path] | None = Field(
         None,
         description="file or address of a cloud, folder of such, or a list of both, worked as one; "

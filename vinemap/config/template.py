@@ -29,11 +29,11 @@ LIMITS = {"ge": "from", "gt": "above", "le": "to", "lt": "below"}
 def template(kind: str) -> str:
     """YAML with all keys of one of ``KINDS`` at their defaults, each with a comment.
 
-    Without changes it configures what stands there already, but for a survey's name, which has no default.
+    Without changes it configures what stands there already, but for what must be given, which stands as an example.
     """
     model = KINDS[kind]
     needed = [name for name, field in model.model_fields.items() if field.examples]
-    free = f"{', '.join(needed)} are an example, all others" if needed else "Every key"
+    free = f"{', '.join(needed)} must be given, all others" if needed else "Every key"
     head = [f"# {_sentence(model)}", f"# {free} may be left out: these are the defaults.", ""]
     return "\n".join([*head, *_lines(model, "")]) + "\n"
 
