@@ -2,7 +2,6 @@
 
 import geopandas as gpd
 import numpy as np
-import pandas as pd
 import pytest
 import shapely
 
@@ -10,7 +9,7 @@ from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.geo.crs import parse_crs
 from vinemap.geo.raster import Grid, Raster
-from vinemap.rows.numbers import count_missing, estimate_vine_spacing, number_rows
+from vinemap.rows.numbers import count_missing, number_rows
 from vinemap.rows.standing.canopy import Standing
 from vinemap.rows.standing.gaps import (
     MISSING,
@@ -92,17 +91,6 @@ def test_missing_vines_are_counted_where_all_was_seen_whichever_way_a_row_runs()
         assert told["n_missing"].tolist() == [2, 2, 0, 2, 2]
         assert counted["n_missing"].tolist() == [8]
         assert_told(told[2:3], [(12, 14, UNSEEN)])
-
-
-def test_voids_say_nothing_of_how_far_vines_are_apart():
-    rng = np.random.default_rng(0)
-    start, n = 0.9 * rng.integers(0, 80, 60), rng.integers(2, 6, 60)
-    row, end = np.repeat(np.arange(15), 4), start + 0.9 * n
-    void = np.column_stack([start, end]) + rng.uniform(0.3, 0.8, 60)[:, None] * [1, -1]
-    parts = [(start, void[:, 0], MISSING), (*void.T, UNSEEN), (void[:, 1], end, MISSING)]
-    gaps = pd.concat(pd.DataFrame({"row_id": row, "start_m": a, "end_m": b, "state": s}) for a, b, s in parts)
-    assert estimate_vine_spacing(gaps) == pytest.approx(0.9, rel=0.005)
-    assert estimate_vine_spacing(gaps[gaps["state"] == UNSEEN]) is None
 
 
 def test_a_row_ends_where_its_parcel_does():

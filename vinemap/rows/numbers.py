@@ -8,7 +8,6 @@ import geopandas as gpd
 import numpy as np
 import shapely
 
-from vinemap.compute.threads import in_threads
 from vinemap.geo.crs import WGS84, is_local, to_wgs84
 from vinemap.geo.main import Corner, Origin, to_main
 from vinemap.rows.standing.canopy import USUAL
@@ -18,9 +17,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.compute.arrays import Floats, Ints
-
-NARROWEST, WIDEST = 0.7, 1.6
-"""Metres between vines of a row, at the least and at the most."""
 
 
 def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
@@ -99,45 +95,18 @@ def count_missing(
     rows, gaps : GeoDataFrame
         With ``row_id``; gaps with ``start_m``, ``end_m``, ``length_m`` and ``state``.
     vine_spacing : float, optional
-        Metres between vines in a row; by default estimated from the gaps, and 1 m where they tell nothing.
+        Metres between vines in a row; by default 1 m, until it is known where they stand.
 
     Returns
     -------
     rows, gaps : GeoDataFrame
         With ``n_missing``; rows with ``vine_spacing_m`` too.
     """
-    spacing = vine_spacing or estimate_vine_spacing(gaps) or USUAL
+    spacing = vine_spacing or USUAL
     n = np.maximum(1, np.rint(gaps["length_m"].to_numpy(dtype=float) / spacing)).astype(np.int64)
     gaps = gaps.assign(n_missing=np.where(gaps["state"] == UNSEEN, 0, n))
     missing = gaps.groupby("row_id")["n_missing"].sum().reindex(rows["row_id"], fill_value=0)
     return rows.assign(n_missing=missing.to_numpy(), vine_spacing_m=spacing), gaps
-
-
-def estimate_vine_spacing(gaps: gpd.GeoDataFrame) -> float | None:
-    """Distance of vines in metres, from where gaps begin and end along their rows.
-
-    Vines stand at equal distances, so the beginnings of a row's gaps lie whole numbers of vines apart, and so do
-    their ends, but for what wasn't seen. The spacing is where the sum of the rows' periodograms peaks; None where the
-    peak isn't clear.
-    """
-    frequency = np.arange(1 / WIDEST, 1 / NARROWEST, 0.0005)
-    places: list[Floats] = []
-    row, hidden = gaps["row_id"].to_numpy(), (gaps["state"] == UNSEEN).to_numpy(dtype=bool)
-    # A number for each place of each row.
-    start, end = (row + 1j * gaps[edge].to_numpy(dtype=float) for edge in ("start_m", "end_m"))
-    for edge, other in ((start, end), (end, start)):
-        told = np.sort_complex(edge[~hidden & ~np.isin(edge, other[hidden])])
-        places += np.split(told.imag, np.flatnonzero(np.diff(told.real)) + 1)
-    spread = sum(len(at) * (len(at) - 1) for at in places)
-
-    def periodogram(at: Floats) -> Floats:
-        out: Floats = np.abs(np.exp(2j * np.pi * frequency[:, None] * at).sum(axis=1)) ** 2 - len(at)
-        return out
-
-    power = np.sum(in_threads(periodogram, places), axis=0)
-    # Edges without any order give sums around zero, with the square root of the number of pairs as deviation.
-    clear = spread > 0 and power.max() > 5 * np.sqrt(spread)
-    return float(1 / frequency[power.argmax()]) if clear else None
 
 
 def describe_rows(
