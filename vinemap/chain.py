@@ -84,19 +84,17 @@ def map_rows(
         If the cloud is too wide for one parcel, or no known row lies in it.
     """
     settings = settings or Settings()
-    options = settings.model_dump()
+    options, high = settings.model_dump(), settings.cover.high
     cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
     lines, remarks = (None, []) if known is None else lines_here(known, seen, chm.crs)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
     seen = seen.without(levels.crowns, chm.grid)
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
-    for stage in ("clustering", "fit"):
-        options[stage]["high"] = settings.cover.high
     n_key_points = 0
     if lines is None:
         key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
         n_key_points = len(key_points)
-        clusters = step("Clusters", cluster_rows, key_points, cover, chm, **options["clustering"])
+        clusters = step("Clusters", cluster_rows, key_points, cover, chm, high=high, **options["clustering"])
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
         remarks = curtain_remarks(courses)
         del key_points, clusters  # much memory
@@ -104,15 +102,15 @@ def map_rows(
         lines, within = space_lines(lines, field), None
         courses = step("Curves", follow_lines, lines, cover, **_how(settings))
     shown = {"cover": cover, "levels": levels, "dtm": dtm, "seen": seen}
-    fit: Callable[..., Any] = partial(fit_rows, cloud=cloud, **shown, **options["fit"])
+    fit: Callable[..., Any] = partial(fit_rows, cloud=cloud, high=high, **shown, **options["fit"])
     rows, gaps = step("Ends and gaps", fit, courses, within=within)
     shift = None
     if lines is not None:
         free = follow_lines(lines, cover) if "keep" in _how(settings).values() else courses
         shift = measure_shift(lines, rows if free is courses else fit(free)[0], free["moves"].to_numpy())
-        rows, options["judging"] = space_lines(rows, field), {"min_confidence": 0.0}
-    rows = judge_rows(group_blocks(rows), cover, chm, field, seen, high=settings.cover.high)
-    rows, gaps = believed(rows, gaps, **options["judging"])
+        rows = space_lines(rows, field)
+    rows = judge_rows(group_blocks(rows), cover, chm, field, seen, high=high)
+    rows, gaps = believed(rows, gaps, min_confidence=settings.judging.min_confidence if lines is None else 0.0)
     if lines is None:
         rows, gaps = number_rows(flag_rows(rows), gaps)
     else:

@@ -65,21 +65,24 @@ def make_product(
         What ``run.json`` is to tell, but for times and files.
     """
     parcel, settings, origin = recipe.parcel, recipe.settings, recipe.origin
+    apart, high = settings.sections.step, settings.cover.high
     with aside() as beside:
         polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
-        known, shift = recipe.known.lines if recipe.known else None, None
-        if known is not None and settings.rows.align and (shift := map_rows(points, settings, known=known).shift):
+        known = recipe.known.lines if recipe.known else None
+        shift = map_rows(points, settings, known=known).shift if known is not None and settings.rows.align else None
+        if shift:
             points = moved(points, -shift.metres, aligned)
         found = map_rows(points, settings, within=polygon, known=known, step=run)
         shift, surfaces = shift or found.shift, (found.dtm, found.chm)
-        written = beside(write_rasters, draft, parcel, rasters := rasters_of(*surfaces, found.field))
-        model, apart, high = model_canopies(found, settings, step=run), settings.sections.step, settings.cover.high
+        rasters = rasters_of(*surfaces, found.field)
+        written = beside(write_rasters, draft, parcel, rasters)
+        model = model_canopies(found, settings, step=run)
         main = origin or corner_of(found.dtm)
         rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
         rows, table = as_seen(rows, model.table, tops=recipe.tops)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
         standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
-        given = settings.missing.model_dump() | {"step": apart, "known": standing}
+        given = {"vine_spacing": settings.missing.vine_spacing, "known": standing, "step": apart}
         rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
         rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
         del model  # much memory, that what follows doesn't need
@@ -94,9 +97,17 @@ def make_product(
             "unmapped": run("Unmapped", find_unmapped, found.chm, rows, outlines if polygon else None, tallest=high),
             "parcel": outlines,
         }
-        about: dict[str, Any] = {"origin": main, "shift": shift, "square": found.field.square}
-        about |= {"n_key_points": found.n_key_points, "remarks": [*found.remarks, *strays]}
-        record = record_of(recipe, found.cloud, layers, surfaces, **about)
+        record = record_of(
+            recipe,
+            found.cloud,
+            layers,
+            surfaces,
+            origin=main,
+            shift=shift,
+            square=found.field.square,
+            n_key_points=found.n_key_points,
+            remarks=[*found.remarks, *strays],
+        )
 
         cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
         del found

@@ -92,9 +92,18 @@ def map_parcel(
     name = check_parcel(parcel)
     if settings:
         check_engines([settings])
-    given: dict[str, Any] = {"boundary": boundary, "crs": crs, "origin": origin}
-    given |= {"rows": rows, "rows_crs": rows_crs, "vines": vines}
-    recipe = recipe_of(cloud, parcel=name, named=named, settings=settings, **given)
+    recipe = recipe_of(
+        cloud,
+        parcel=name,
+        named=named,
+        settings=settings,
+        boundary=boundary,
+        crs=crs,
+        origin=origin,
+        rows=rows,
+        rows_crs=rows_crs,
+        vines=vines,
+    )
     return follow(recipe, folder, step=step)
 
 
@@ -163,8 +172,7 @@ def _read(recipe: Recipe, piece: Piece | None, draft: Path) -> Cloud:
     if piece:
         cloud = read_piece(piece, collector)
     else:
-        how: dict[str, Any] = {"crs": recipe.crs, "boundary": recipe.boundary, "engine": engine}
-        cloud = read_cloud(recipe.clouds, collector=collector, **how)
+        cloud = read_cloud(recipe.clouds, collector=collector, crs=recipe.crs, boundary=recipe.boundary, engine=engine)
         recipe.check()
     if engine == "vinemap":
         return cloud

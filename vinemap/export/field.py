@@ -178,8 +178,8 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
     rows = rows.sort_values("row_id", ignore_index=True)
     bounded = bool(record.get("bounded"))
     within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None
-    drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
-    lanes = lanes_between(rows if lines != "rows" else rows[:0], within, **drawn)
+    between = rows if lines != "rows" else rows[:0]
+    lanes = lanes_between(between, within, headland=headland, outer=outer, vertices=vertices)
     if lines != "rows" and len(lanes) == 0:
         raise InputError(
             f"{naming.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"

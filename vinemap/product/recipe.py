@@ -251,8 +251,19 @@ def recipe_of(
         points = vines_of(read_points(vines, VINES, crs=rows_crs, local=local), {parcel: polygon})[parcel]
         if len(points) == 0:
             raise InputError(f"{vines}: none of its vines stands in the parcel: is its CRS the right one?")
-    given = fit_for(settings or Settings(), files), crs, origin, date, None, remarks, known, points
-    return Recipe(parcel, files, sources, polygon, *given)
+    return Recipe(
+        parcel=parcel,
+        clouds=files,
+        sources=sources,
+        boundary=polygon,
+        settings=fit_for(settings or Settings(), files),
+        crs=crs,
+        origin=origin,
+        flown=date,
+        remarks=remarks,
+        known=known,
+        vines=points,
+    )
 
 
 def fit_for(settings: Settings, clouds: Sequence[Path]) -> Settings:

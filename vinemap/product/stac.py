@@ -295,6 +295,13 @@ def write_item(folder: Path, recipe: Recipe, record: dict[str, Any], polygons: g
         "unmapped_m2": round(sum(area for reason, area in record["unmapped_m2"].items() if reason != TALL), 1),
         "area_m2": round(float(polygons.area.sum()), 1),
     }
-    where: dict[str, Any] = {"polygon": polygons.union_all(), "crs": polygons.crs, "survey": recipe.survey}
-    item = parcel_item(folder, recipe.parcel, flown=recipe.flown, properties=properties, **where)
+    item = parcel_item(
+        folder,
+        recipe.parcel,
+        flown=recipe.flown,
+        properties=properties,
+        polygon=polygons.union_all(),
+        crs=polygons.crs,
+        survey=recipe.survey,
+    )
     save(item, paths.stac_item(folder, recipe.parcel))

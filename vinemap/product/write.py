@@ -94,8 +94,8 @@ def _write_meshes(
     path, origin = paths.canopy_mesh(folder, parcel), np.round(np.mean(points.extent, axis=0))
     extras = {"vertical": points.vertical}
     write_glb(meshes, path, origin=origin, crs=points.crs.to_string(), extras=extras, plain=plain)
-    where: dict[str, Any] = {"origin": origin, "crs": points.crs, "vertical": points.vertical, "geoid": geoid}
-    if tileset := parcel_tileset(meshes, path.name, **where):
+    tileset = parcel_tileset(meshes, path.name, origin=origin, crs=points.crs, vertical=points.vertical, geoid=geoid)
+    if tileset:
         paths.tileset(folder).write_text(json.dumps(tileset, indent=1), encoding="utf-8")
 
 
