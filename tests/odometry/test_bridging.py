@@ -5,7 +5,7 @@ import pytest
 
 from vinemap.odometry.poses import STILL, Pose, moved, onward, onward_covariance
 from vinemap.odometry.sensors.bridging import bridged, joined
-from vinemap.odometry.sensors.places import Places
+from vinemap.odometry.sensors.fixes import Places
 from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, Wheels
 from vinemap.odometry.step import Motion

@@ -10,7 +10,7 @@ from vinemap.errors import InputError
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import STILL, Pose, moved, onward, onward_covariance
 from vinemap.odometry.sensors.files import check_times
-from vinemap.odometry.sensors.places import Places, read_places
+from vinemap.odometry.sensors.fixes import Places, read_places
 from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, Wheels, read_wheels
 from vinemap.odometry.step import Motion

@@ -19,7 +19,7 @@ from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_la
 from vinemap.odometry.poses import STILL, moved
 from vinemap.odometry.sensors.bridging import bridged, joined
 from vinemap.odometry.sensors.files import check_times
-from vinemap.odometry.sensors.places import read_places
+from vinemap.odometry.sensors.fixes import read_places
 from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import Fix, follow

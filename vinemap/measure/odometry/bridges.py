@@ -11,7 +11,7 @@ from vinemap.measure.odometry.trials import path, views
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
 from vinemap.odometry.sensors.bridging import bridged, joined
-from vinemap.odometry.sensors.places import Places
+from vinemap.odometry.sensors.fixes import Places
 from vinemap.odometry.sensors.wheels import Odometer, Wheels
 from vinemap.odometry.track import follow
 from vinemap.simulate.camera import LOW

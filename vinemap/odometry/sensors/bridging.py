@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from vinemap.compute.arrays import Ints, Values
-    from vinemap.odometry.sensors.places import Places
+    from vinemap.odometry.sensors.fixes import Places
     from vinemap.odometry.sensors.wheels import Odometer
     from vinemap.odometry.track import Fix
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vinemap.compute.arrays import Flags, Values
-    from vinemap.odometry.sensors.places import Places
+    from vinemap.odometry.sensors.fixes import Places
     from vinemap.odometry.track import Fix
 
 START_MM, START_DEG = 1000.0, 10.0
