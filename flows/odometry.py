@@ -41,7 +41,7 @@ def drive_flow(drive: str, config: DrivesConfig, camera: Camera) -> DriveSummary
         start=own.start,
         rows=config.rows if own.start else None,
         motion=own.motion,
-        places=own.fixes,
+        fixes=own.fixes,
         template_share=options.template_share,
         angles=(-options.turn_deg, options.turn_deg),
         method=options.method,

@@ -139,10 +139,10 @@ def test_other_sensors_go_along(recording, robot, tmp_path):
     last = f"{begun + (N - 1) / 4},{lat!r},{lon!r},0.001\n"
     known.write_text(f"time,lat,lon,accuracy_m\n{begun},{START.lat},{START.lon},0.001\n{last}")
     out = tmp_path / "track.gpkg"
-    summary = map_drive([recording], out, camera=LOW, start=START, motion=wheels, places=known)
+    summary = map_drive([recording], out, camera=LOW, start=START, motion=wheels, fixes=known)
     assert "wheels say +13% of the way" in summary.line()
     known.write_text(f"time,lat,lon,accuracy_m\n{begun},{START.lat},{START.lon},1\n{last}{begun + 1},45,9,0.1\n")
-    summary = map_drive([recording], out, camera=LOW, start=START, places=known)
+    summary = map_drive([recording], out, camera=LOW, start=START, fixes=known)
     assert "1 of 3 fixes left out" in summary.line()
     found = gpd.read_file(out, layer="poses").iloc[-1]
     assert abs(Geod(ellps="WGS84").inv(lon, lat, found["lon"], found["lat"])[2]) < 0.005
@@ -151,7 +151,7 @@ def test_other_sensors_go_along(recording, robot, tmp_path):
     )
     for options, says in [
         ({"motion": wheels}, "of the way that frames show: is the unit"),
-        ({"places": known, "start": None}, "fixes need a start"),
+        ({"fixes": known, "start": None}, "fixes need a start"),
     ]:
         with pytest.raises(InputError, match=says):
             map_drive([recording], out, camera=LOW, **{"start": START} | options)

@@ -36,8 +36,10 @@ def spoilt(shots, lens, seed=1):
     ]
 
 
-def off(fixes, robot):
-    steps = [(moved(fixes[0].pose, fix.pose), moved(robot[0], true)) for fix, true in zip(fixes, robot, strict=True)]
+def off(track, robot):
+    steps = [
+        (moved(track[0].pose, point.pose), moved(robot[0], true)) for point, true in zip(track, robot, strict=True)
+    ]
     return max(np.hypot(found.x_mm - true.x_mm, found.y_mm - true.y_mm) for found, true in steps)
 
 
@@ -51,9 +53,9 @@ def test_clean_frames_are_left_as_they_are(faint):
 @pytest.mark.parametrize("lens", ["60 spots of dirt", "mud on half of the lens", "text"])
 def test_a_drive_is_followed_through_what_is_on_the_lens(shots, lens):
     dirty = spoilt(shots, lens)
-    fixes = list(follow(frames(dirty), camera=LOW, foresight=N))
-    assert sum(fix.flag != "" for fix in fixes) <= 2
-    assert off(fixes, poses(N)) < 5
+    track = list(follow(frames(dirty), camera=LOW, foresight=N))
+    assert sum(point.flag != "" for point in track) <= 2
+    assert off(track, poses(N)) < 5
 
 
 def test_a_field_is_what_the_light_is_dimmed_by(shots):
@@ -67,10 +69,10 @@ def test_a_field_is_what_the_light_is_dimmed_by(shots):
 def test_dirt_on_faint_ground_is_never_standing_still(shots):
     """Of two frames alone, and before a field is known."""
     dirty = spoilt(shots, "20 spots of dirt")
-    for k, fix in enumerate(follow(frames(dirty), camera=LOW)):
-        assert fix.flag or k == 0 or off([fix], [poses(N)[k]]) == 0
-        if fix.measured_from is not None:
-            step = moved(poses(N)[fix.measured_from], poses(N)[k])
+    for k, point in enumerate(follow(frames(dirty), camera=LOW)):
+        assert point.flag or k == 0 or off([point], [poses(N)[k]]) == 0
+        if point.measured_from is not None:
+            step = moved(poses(N)[point.measured_from], poses(N)[k])
             assert np.hypot(*step[:2]) > 30
             break
     motions = [estimate_motion(*pair, camera=LOW) for pair in pairwise(dirty)]
@@ -80,12 +82,12 @@ def test_dirt_on_faint_ground_is_never_standing_still(shots):
 def test_standing_still_is_shown_by_ground(faint):
     robot = [poses(N)[k // 3] for k in range(N)]
     dirty = spoilt([render(faint, pose, seed=k) for k, pose in enumerate(robot)], "20 spots of dirt")
-    fixes = list(follow(frames(dirty), camera=LOW, foresight=N))
+    track = list(follow(frames(dirty), camera=LOW, foresight=N))
     still = [k for k in range(1, N) if robot[k] == robot[k - 1]]
-    assert sum(fixes[k].flag == "" for k in still) == len(still)
-    assert off(fixes, robot) < 2
+    assert sum(track[k].flag == "" for k in still) == len(still)
+    assert off(track, robot) < 2
     alone = list(follow(frames(dirty[:3]), camera=LOW))
-    assert [fix.flag for fix in alone] == ["", "", ""]
+    assert [point.flag for point in alone] == ["", "", ""]
 
 
 def test_nothing_is_learned_of_one_place(faint):
@@ -108,9 +110,9 @@ def test_what_a_mask_hides_is_no_ground():
 
 def test_repeated_frames_are_told_from_a_standstill_by_noise(shots):
     again = [*shots[:5], shots[4], shots[4], *shots[5:8]]
-    fixes = list(follow(frames(again), camera=LOW))
-    assert [fix.flag for fix in fixes] == [""] * 5 + ["repeated"] * 2 + [""] * 3
-    assert off(fixes[:5] + fixes[7:], poses(8)) < 1
+    track = list(follow(frames(again), camera=LOW))
+    assert [point.flag for point in track] == [""] * 5 + ["repeated"] * 2 + [""] * 3
+    assert off(track[:5] + track[7:], poses(8)) < 1
     assert not repeats(*frames(images(poses(1) * 2)))
 
 

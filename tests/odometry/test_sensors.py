@@ -10,11 +10,11 @@ from vinemap.errors import InputError
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import STILL, Pose, moved, onward, onward_covariance
 from vinemap.odometry.sensors.files import check_times
-from vinemap.odometry.sensors.fixes import Places, read_places
+from vinemap.odometry.sensors.fixes import Fixes, read_fixes
 from vinemap.odometry.sensors.pulling import pulled
 from vinemap.odometry.sensors.wheels import Odometer, Wheels, read_wheels
 from vinemap.odometry.step import Motion
-from vinemap.odometry.track import UNSURE_MM, UNSURE_SHARE, Fix, follow
+from vinemap.odometry.track import UNSURE_MM, UNSURE_SHARE, TrackPoint, follow
 from vinemap.simulate.camera import LOW
 
 START = Start(44.61167, 7.92442, 72.5)
@@ -25,9 +25,9 @@ def wheels(speed=300.0, rate=10.0, n=41):
     return Wheels(np.arange(n) / 10, np.full(n, speed), np.full(n, rate))
 
 
-def track(n=30, *, lost=(), seed=0, period=0.2):
+def tracked(n=30, *, lost=(), seed=0, period=0.2):
     """A track whose steps err as they say, the true poses, and where it guesses."""
-    rng, fixes, true = np.random.default_rng(seed), [], []
+    rng, track, true = np.random.default_rng(seed), [], []
     pose, truth, covariance = STILL, STILL, np.zeros((3, 3))
     for k in range(n):
         bad = k in lost
@@ -37,13 +37,15 @@ def track(n=30, *, lost=(), seed=0, period=0.2):
             covariance = onward_covariance(pose, covariance, step, of_step)
             pose, truth = onward(pose, step), onward(truth, STEP)
             motion = None if bad else Motion(*step, of_step)
-            fixes.append(
-                Fix(str(k), k * period, pose, covariance, of_step, 245.0, "blank" * bad, None if bad else k - 1, motion)
+            track.append(
+                TrackPoint(
+                    str(k), k * period, pose, covariance, of_step, 245.0, "blank" * bad, None if bad else k - 1, motion
+                )
             )
         else:
-            fixes.append(Fix("0", 0.0, pose, covariance, of_step, 245.0))
+            track.append(TrackPoint("0", 0.0, pose, covariance, of_step, 245.0))
         true.append(truth)
-    return fixes, true
+    return track, true
 
 
 def slopes_of(start, end, by=1e-3):
@@ -61,8 +63,8 @@ def slopes_of(start, end, by=1e-3):
     return (np.array(ways) - moved(start, end)).T / by
 
 
-def off(fixes, true):
-    return np.array([np.hypot(f.pose.x_mm - t.x_mm, f.pose.y_mm - t.y_mm) for f, t in zip(fixes, true, strict=True)])
+def off(track, true):
+    return np.array([np.hypot(f.pose.x_mm - t.x_mm, f.pose.y_mm - t.y_mm) for f, t in zip(track, true, strict=True)])
 
 
 def test_wheels_drive_an_arc():
@@ -121,12 +123,12 @@ def test_wheels_bridge_a_lost_stretch():
 
 
 def test_fixes_pull_the_track_to_where_they_are():
-    fixes, true = track(lost={10, 11, 12, 13})
+    track, true = tracked(lost={10, 11, 12, 13})
     ends = np.array([true[0][:2], true[-1][:2]])
-    found, left_out, _ = pulled(fixes, Places(np.array([0.0, 29 * 0.2]), ends, np.array([20.0, 20.0])))
+    found, left_out, _ = pulled(track, Fixes(np.array([0.0, 29 * 0.2]), ends, np.array([20.0, 20.0])))
     assert left_out == 0
-    assert off(found, true)[-1] < 10 < off(fixes, true)[-1]
-    assert off(found, true).max() < off(fixes, true).max()
+    assert off(found, true)[-1] < 10 < off(track, true)[-1]
+    assert off(found, true).max() < off(track, true).max()
     steps = [moved(found[k - 1].pose, found[k].pose) for k in range(20, 30)]
     assert np.array(steps)[:, 0] == pytest.approx([60] * 10, abs=0.5)  # what was measured stays
 
@@ -134,10 +136,10 @@ def test_fixes_pull_the_track_to_where_they_are():
 def test_the_covariance_of_a_pulled_track_is_that_of_its_errors():
     z = []
     for seed in range(40):
-        fixes, true = track(20, lost={8, 9}, seed=seed)
+        track, true = tracked(20, lost={8, 9}, seed=seed)
         rng = np.random.default_rng(seed)
         ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, 20, (2, 2))
-        found = pulled(fixes, Places(np.array([0.0, 19 * 0.2]), ends, np.array([20.0, 20.0]))).fixes
+        found = pulled(track, Fixes(np.array([0.0, 19 * 0.2]), ends, np.array([20.0, 20.0]))).track
         e = np.array(found[9].pose[:2]) - true[9][:2]
         z.append(e @ np.linalg.solve(found[9].covariance[:2, :2], e))
     assert 1.4 < np.mean(z) < 2.7  # 2 expected, 95% of 80 degrees of freedom
@@ -145,58 +147,58 @@ def test_the_covariance_of_a_pulled_track_is_that_of_its_errors():
 
 def test_covariances_of_a_pulled_track_are_those_of_its_whole_normal_matrix():
     """Keyframes make a tree of it; places are at both ends and in its midst."""
-    fixes, true = track(40, lost={8, 9, 25})
-    for k, fix in enumerate(fixes):
-        if fix.motion:
+    track, true = tracked(40, lost={8, 9, 25})
+    for k, point in enumerate(track):
+        if point.motion:
             key = (k - 1) // 4 * 4
-            motion = Motion(*moved(fixes[key].pose, fix.pose), fix.of_step)
-            fixes[k] = fix._replace(measured_from=key, motion=motion)
+            motion = Motion(*moved(track[key].pose, point.pose), point.of_step)
+            track[k] = point._replace(measured_from=key, motion=motion)
     at = np.array([0, 22, 39])
-    found = pulled(fixes, Places(at * 0.2, np.array([true[k][:2] for k in at]), np.full(3, 20.0))).fixes
+    found = pulled(track, Fixes(at * 0.2, np.array([true[k][:2] for k in at]), np.full(3, 20.0))).track
     normal = np.zeros((40, 3, 40, 3))
     normal[0, :, 0] = np.diag([1e-6, 1e-6, 1e-2])
     normal[at, :2, at, :2] += np.eye(2) / 20**2
-    for k, fix in enumerate(found[1:], start=1):
-        parent = k - 1 if fix.measured_from is None else fix.measured_from
-        slopes = slopes_of(found[parent].pose, fix.pose)
-        known = (slopes.T @ np.linalg.inv(fix.of_step) @ slopes).reshape(2, 3, 2, 3)
+    for k, point in enumerate(found[1:], start=1):
+        parent = k - 1 if point.measured_from is None else point.measured_from
+        slopes = slopes_of(found[parent].pose, point.pose)
+        known = (slopes.T @ np.linalg.inv(point.of_step) @ slopes).reshape(2, 3, 2, 3)
         for a, row in enumerate((parent, k)):
             for b, column in enumerate((parent, k)):
                 normal[row, :, column] += known[a, :, b]
     whole = np.linalg.inv(normal.reshape(120, 120)).reshape(40, 3, 40, 3)
-    for k, fix in enumerate(found):
-        assert fix.covariance == pytest.approx(whole[k, :, k], rel=1e-3, abs=1e-4)
+    for k, point in enumerate(found):
+        assert point.covariance == pytest.approx(whole[k, :, k], rel=1e-3, abs=1e-4)
 
 
 def test_a_track_that_begins_with_bad_frames_is_pulled_too():
     shots = [frame._replace(time=k / 10) for k, frame in enumerate(frames([None, None, *images(poses(14))[:4]]))]
-    fixes = list(follow(iter(shots), camera=LOW))
-    assert [fix.covariance.any() for fix in fixes[2:]] == [False, True, True, True]
-    found = pulled(fixes, Places(np.array([0.5]), np.array([[300.0, 0.0]]), np.array([10.0]))).fixes
+    track = list(follow(iter(shots), camera=LOW))
+    assert [point.covariance.any() for point in track[2:]] == [False, True, True, True]
+    found = pulled(track, Fixes(np.array([0.5]), np.array([[300.0, 0.0]]), np.array([10.0]))).track
     assert found[-1].pose.x_mm == pytest.approx(300, abs=5)
-    assert all(np.linalg.eigvalsh(fix.covariance)[0] > 0 for fix in found)
+    assert all(np.linalg.eigvalsh(point.covariance)[0] > 0 for point in found)
 
 
 def test_a_fix_far_off_is_left_out():
-    fixes, true = track()
+    track, true = tracked()
     at = np.array([0, 10, 20, 29])
     xy = np.array([true[k][:2] for k in at])
     xy[2] += 5000
-    found, left_out, _ = pulled(fixes, Places(at * 0.2, xy, np.full(4, 20.0)))
+    found, left_out, _ = pulled(track, Fixes(at * 0.2, xy, np.full(4, 20.0)))
     assert left_out == 1
     assert off(found, true).max() < 10
-    assert pulled(fixes, Places(np.array([0.0, 900.0]), xy[:2], np.full(2, 20.0))).left_out == 1
+    assert pulled(track, Fixes(np.array([0.0, 900.0]), xy[:2], np.full(2, 20.0))).left_out == 1
 
 
 def test_places_are_in_the_frame_of_the_start(tmp_path):
     lon, lat, _ = Geod(ellps="WGS84").fwd(START.lon, START.lat, START.heading_deg, 10.0)
     path = tmp_path / "fixes.csv"
     path.write_text(f"time;lat;lon;accuracy_m\n2026-05-14T08:00:00Z;{lat!r};{lon!r};0.02\nbad;1;2;3\n")
-    places, left_out = read_places(path, START)
+    fixes, left_out = read_fixes(path, START)
     assert left_out == 1
-    assert places.xy == pytest.approx(np.array([[10_000.0, 0.0]]), abs=1)
-    assert places.times == pytest.approx([1778745600])
-    assert places.sd == pytest.approx([20.0])
+    assert fixes.xy == pytest.approx(np.array([[10_000.0, 0.0]]), abs=1)
+    assert fixes.times == pytest.approx([1778745600])
+    assert fixes.sd == pytest.approx([20.0])
 
 
 def test_lines_that_jump_are_left_out(tmp_path):
@@ -235,11 +237,11 @@ def test_fixes_that_cant_be_used_are_told(tmp_path):
     path = tmp_path / "fixes.csv"
     path.write_text("time,lat,lon\n1,2,3\n")
     with pytest.raises(InputError, match="has no column accuracy_m"):
-        read_places(path, START)
+        read_fixes(path, START)
     path.write_text("time,lat,lon,accuracy_m\n1,200,3,-1\n")
     with pytest.raises(InputError, match="holds no line with a time, a place and an accuracy"):
-        read_places(path, START)
+        read_fixes(path, START)
     with pytest.raises(InputError, match="of another day"):
-        check_times(path, np.array([9e8]), track()[0])
+        check_times(path, np.array([9e8]), tracked()[0])
     with pytest.raises(InputError, match="the frames have no times"):
-        check_times(path, np.array([1.0]), [fix._replace(time=None) for fix in track()[0]])
+        check_times(path, np.array([1.0]), [point._replace(time=None) for point in tracked()[0]])

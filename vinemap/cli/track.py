@@ -60,7 +60,7 @@ def track(
         start=start,
         rows=rows,
         motion=motion,
-        places=fixes,
+        fixes=fixes,
         template_share=template_share,
         angles=(-turn, turn),
         method=method,

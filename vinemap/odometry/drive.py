@@ -19,10 +19,10 @@ from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_la
 from vinemap.odometry.poses import STILL, moved
 from vinemap.odometry.sensors.bridging import bridged, joined
 from vinemap.odometry.sensors.files import check_times
-from vinemap.odometry.sensors.fixes import read_places
+from vinemap.odometry.sensors.fixes import read_fixes
 from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
-from vinemap.odometry.track import Fix, follow
+from vinemap.odometry.track import TrackPoint, follow
 from vinemap.product.geopackage import write_geopackage
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def map_drive(
     start: Start | None = None,
     rows: Path | None = None,
     motion: Path | None = None,
-    places: Path | None = None,
+    fixes: Path | None = None,
     template_share: float = 0.2,
     angles: tuple[float, float] = ANGLES,
     method: Method = "aligned",
@@ -109,7 +109,7 @@ def map_drive(
         Vine rows, for the distance to the nearest one; the track is in their CRS if that is metric. Wants a start.
     motion : Path, optional
         CSV of wheel speeds and yaw rates, which bridge what frames don't tell.
-    places : Path, optional
+    fixes : Path, optional
         CSV of satellite fixes, which pull the track. Wants a start.
     show : callable
         Is given the frames and their number, where that is known, and gives them on: progress.
@@ -126,16 +126,16 @@ def map_drive(
     _check_out(out, rows)
     if rows and not start:
         raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
-    if places and not start:
-        raise InputError(f"{places}: fixes need a start: give --start lat,lon,heading, roughly")
+    if fixes and not start:
+        raise InputError(f"{fixes}: fixes need a start: give --start lat,lon,heading, roughly")
     lines = _rows_of(rows) if rows else None
     wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
-    known, odd_places = read_places(places, start) if places and start else (None, 0)
+    known, odd_fixes = read_fixes(fixes, start) if fixes and start else (None, 0)
     crs = _crs_of(start, lines)
     odometer = Odometer(wheels) if wheels else None
     source = read_recording(recording, camera=camera)
 
-    def followed() -> list[Fix]:
+    def followed() -> list[TrackPoint]:
         frames = show(source.frames, source.n_frames)
         told = follow(
             frames,
@@ -148,53 +148,53 @@ def map_drive(
         )
         return list(told)
 
-    def placed(fixes: list[Fix]) -> dict[str, gpd.GeoDataFrame]:
-        layers = track_layers(fixes, start=start, crs=crs)
+    def placed(track: list[TrackPoint]) -> dict[str, gpd.GeoDataFrame]:
+        layers = track_layers(track, start=start, crs=crs)
         if lines is None:
             return layers
         return layers | {"poses": beside_rows(layers["poses"], lines)}
 
     if lines is not None:
         placed(
-            [Fix("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)]
+            [TrackPoint("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)]
         )  # whether start and rows go together
-    fixes = step(STAGES[0], followed)
-    _check_fixes(fixes, recording, camera)
+    track = step(STAGES[0], followed)
+    _check_track(track, recording, camera)
     remarks = []
     if motion and wheels:
-        check_times(motion, wheels.times, fixes)
+        check_times(motion, wheels.times, track)
         remarks += [f"{odd_wheels} lines of {motion} left out"] * (odd_wheels > 0) + _against_wheels(
-            motion, wheels, fixes
+            motion, wheels, track
         )
-    if places and known:
-        check_times(places, known.times, fixes)
-        fixes, far, fit = step(STAGES[1], joined, fixes, known, odometer)
-        remarks += [f"{odd_places + far} of {odd_places + len(known.sd)} fixes left out"] * (odd_places + far > 0)
+    if fixes and known:
+        check_times(fixes, known.times, track)
+        track, far, fit = step(STAGES[1], joined, track, known, odometer)
+        remarks += [f"{odd_fixes + far} of {odd_fixes + len(known.sd)} fixes left out"] * (odd_fixes + far > 0)
         remarks += ["fixes contradict the track by more than both err"] * (not fit)
     else:
-        fixes = step(STAGES[1], bridged, fixes, odometer)
-    layers = step(STAGES[1], placed, fixes)
+        track = step(STAGES[1], bridged, track, odometer)
+    layers = step(STAGES[1], placed, track)
     step(STAGES[2], _write, layers, out)
-    flags = [fix.flag for fix in fixes if fix.flag]
+    flags = [point.flag for point in track if point.flag]
     return DriveSummary(
         out,
-        n_frames=len(fixes),
-        n_missing=max(0, (source.n_frames or 0) - len(fixes)),
+        n_frames=len(track),
+        n_missing=max(0, (source.n_frames or 0) - len(track)),
         flags={flag: flags.count(flag) for flag in set(flags)},
         length_m=float(layers["track"]["length_m"].sum()),
         n_stretches=len(layers["track"]),
         remarks=tuple(remarks),
-        sunk=max((1 - fix.height_mm / camera.above_ground_mm for fix in fixes), key=abs),
+        sunk=max((1 - point.height_mm / camera.above_ground_mm for point in track), key=abs),
     )
 
 
-def _against_wheels(path: Path, wheels: Wheels, fixes: Sequence[Fix]) -> list[str]:
+def _against_wheels(path: Path, wheels: Wheels, track: Sequence[TrackPoint]) -> list[str]:
     """What wheels say otherwise than frames, in a line; InputError if it is so much that their unit must be wrong."""
     seen = by_wheels = 0.0
-    for before, fix in pairwise(fixes):
-        driven = wheels.between(before.time, fix.time, STILL)
-        if driven and not before.flag and not fix.flag:
-            seen += float(np.hypot(*moved(before.pose, fix.pose)[:2]))
+    for before, point in pairwise(track):
+        driven = wheels.between(before.time, point.time, STILL)
+        if driven and not before.flag and not point.flag:
+            seen += float(np.hypot(*moved(before.pose, point.pose)[:2]))
             by_wheels += float(np.hypot(*driven[0][:2]))
     if not (seen > LEAST_WAY and np.isfinite(wheels.speeds).all()):
         return []
@@ -226,24 +226,24 @@ def _crs_of(start: Start | None, rows: gpd.GeoDataFrame | None) -> CRS:
     return metric_crs(rows.crs, (west + east) / 2, (south + north) / 2)
 
 
-def _check_fixes(fixes: Sequence[Fix], recording: Sequence[Path], camera: Camera) -> None:
+def _check_track(track: Sequence[TrackPoint], recording: Sequence[Path], camera: Camera) -> None:
     """Raise InputError if nothing was measured."""
     name = recording[0]
-    if any(fix.measured_from is not None for fix in fixes):
+    if any(point.measured_from is not None for point in track):
         return
-    used = [fix for fix in fixes if fix.flag not in ("unreadable", "size")]
+    used = [point for point in track if point.flag not in ("unreadable", "size")]
     if len(used) > 1:
-        flags = ", ".join(sorted({fix.flag for fix in used} - {""}))
-        raise InputError(f"{name}: none of {len(fixes)} frames could be measured from another ({flags})")
-    if len(fixes) == 1:
+        flags = ", ".join(sorted({point.flag for point in used} - {""}))
+        raise InputError(f"{name}: none of {len(track)} frames could be measured from another ({flags})")
+    if len(track) == 1:
         raise InputError(f"{name}: one frame alone shows no movement: give two at least")
-    wrong = sum(fix.flag == "size" for fix in fixes)
+    wrong = sum(point.flag == "size" for point in track)
     if wrong:
         raise InputError(
-            f"{name}: {wrong} of {len(fixes)} frames don't have the camera's {camera.width} × {camera.height} pixels: "
+            f"{name}: {wrong} of {len(track)} frames don't have the camera's {camera.width} × {camera.height} pixels: "
             "give the camera file of these frames"
         )
-    raise InputError(f"{name}: {len(fixes) - len(used)} of {len(fixes)} frames can't be read: give two at least")
+    raise InputError(f"{name}: {len(track) - len(used)} of {len(track)} frames can't be read: give two at least")
 
 
 def _check_out(out: Path, rows: Path | None) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from vinemap.config.drives import Start
-    from vinemap.odometry.track import Fix
+    from vinemap.odometry.track import TrackPoint
 
 NOWHERE = CRS.from_wkt(
     'ENGCRS["Track: metres to the right of its start and ahead",EDATUM["start of the track"],CS[Cartesian,2],'
@@ -63,12 +63,12 @@ TRACK_LAYERS: dict[str, Layer] = {
 """What the GeoPackage of a robot's track holds."""
 
 
-def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
+def track_layers(track: Sequence[TrackPoint], *, start: Start | None, crs: CRS) -> dict[str, gpd.GeoDataFrame]:
     """Layers of the contract :data:`vinemap.odometry.layers.TRACK_LAYERS`, without rows.
 
     Parameters
     ----------
-    fixes : sequence of Fix
+    track : sequence of TrackPoint
         In order, the first measured one at the start.
     start : Start, optional
         Without it the track starts northward at the origin of :data:`NOWHERE`.
@@ -76,17 +76,17 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
         Projected CRS of the layers.
     """
     first = Pose(0.0, 0.0, 90.0 - (start.heading_deg if start else 0.0))
-    east, north, heading = np.array([onward(first, fix.pose) for fix in fixes]).T
+    east, north, heading = np.array([onward(first, point.pose) for point in track]).T
     east, north = east / 1000, north / 1000
     xy, lat, lon = _on_the_map(east, north, start, crs)
-    seconds = np.array([np.nan if fix.time is None else fix.time for fix in fixes])
+    seconds = np.array([np.nan if point.time is None else point.time for point in track])
     dated = np.where(seconds > DATED, seconds, np.nan)
     seconds = dated if np.isfinite(dated).any() else seconds
     known = seconds[np.isfinite(seconds)]
     poses = gpd.GeoDataFrame(
         {
-            "pose": np.arange(1, len(fixes) + 1),
-            "frame": [fix.frame for fix in fixes],
+            "pose": np.arange(1, len(track) + 1),
+            "frame": [point.frame for point in track],
             "time": pd.to_datetime(pd.Series(dated), unit="s", utc=True),
             "seconds": seconds - (known[0] if len(known) else 0.0),
             "x_m": east,
@@ -94,16 +94,16 @@ def track_layers(fixes: Sequence[Fix], *, start: Start | None, crs: CRS) -> dict
             "heading_deg": (90.0 - heading) % 360,
             "lat": lat,
             "lon": lon,
-            "score": [fix.motion.score if fix.motion else 0.0 for fix in fixes],
-            "agreement": [fix.motion.agreement if fix.motion else 0.0 for fix in fixes],
-            "overlap": [fix.motion.overlap if fix.motion else 0.0 for fix in fixes],
-            "height_mm": [fix.height_mm for fix in fixes],
-            "tilt_deg": [fix.motion.tilt_deg if fix.motion else np.nan for fix in fixes],
-            "flag": [fix.flag for fix in fixes],
-            "measured_from": [0 if fix.measured_from is None else fix.measured_from + 1 for fix in fixes],
-            "stretch": stretches(fixes),
-            "sd_m": [np.sqrt(np.linalg.eigvalsh(fix.covariance[:2, :2])[-1]) / 1000 for fix in fixes],
-            "sd_heading_deg": [np.sqrt(fix.covariance[2, 2]) for fix in fixes],
+            "score": [point.motion.score if point.motion else 0.0 for point in track],
+            "agreement": [point.motion.agreement if point.motion else 0.0 for point in track],
+            "overlap": [point.motion.overlap if point.motion else 0.0 for point in track],
+            "height_mm": [point.height_mm for point in track],
+            "tilt_deg": [point.motion.tilt_deg if point.motion else np.nan for point in track],
+            "flag": [point.flag for point in track],
+            "measured_from": [0 if point.measured_from is None else point.measured_from + 1 for point in track],
+            "stretch": stretches(track),
+            "sd_m": [np.sqrt(np.linalg.eigvalsh(point.covariance[:2, :2])[-1]) / 1000 for point in track],
+            "sd_heading_deg": [np.sqrt(point.covariance[2, 2]) for point in track],
             "row": "",
             "row_distance_m": np.nan,
             "row_position_m": np.nan,

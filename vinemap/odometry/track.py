@@ -43,7 +43,7 @@ class Sensor(Protocol):
         """Be held against a movement that frames tell."""
 
 
-class Fix(NamedTuple):
+class TrackPoint(NamedTuple):
     """Where the robot was when a frame was taken."""
 
     frame: str
@@ -86,7 +86,7 @@ def follow(
     keyframes: bool = True,
     foresight: int = 0,
     sensor: Sensor | None = None,
-) -> Iterator[Fix]:
+) -> Iterator[TrackPoint]:
     """Follow a robot frame by frame, each pose told as soon as its frame is there.
 
     A frame is measured from a keyframe as long as both show enough of the same ground, as each measured step adds its
@@ -140,7 +140,7 @@ def follow(
         covariance = onward_covariance(pose, covariance, step, of_step)
         pose = onward(pose, step)
         taken, time = time, frame.time
-        guess = Fix(frame.name, frame.time, pose, covariance, of_step, height)
+        guess = TrackPoint(frame.name, frame.time, pose, covariance, of_step, height)
         if frame.image is None or (shown is not None and repeats(shown, frame)):
             yield guess._replace(flag=frame.flaw or "repeated")
             continue
@@ -173,14 +173,14 @@ def follow(
             sensor.learn(taken, frame.time, moved(last.pose, pose))
         velocity = _per_frame(moved(before.pose, pose), number - before.number)
         last, key, lost = _Anchor(number, view, pose, covariance, height), anchor, None
-        yield Fix(frame.name, frame.time, pose, covariance, motion.covariance, height, "", anchor.number, motion)
+        yield TrackPoint(frame.name, frame.time, pose, covariance, motion.covariance, height, "", anchor.number, motion)
 
 
-def stretches(fixes: Iterable[Fix]) -> list[int]:
+def stretches(track: Iterable[TrackPoint]) -> list[int]:
     """Number, from 1 on, of the unbroken stretch of the track that each pose belongs to; 0 for poses that are alone."""
     roots: list[int] = []
-    for number, fix in enumerate(fixes):
-        roots.append(number if fix.measured_from is None else roots[fix.measured_from])
+    for number, point in enumerate(track):
+        roots.append(number if point.measured_from is None else roots[point.measured_from])
     counts = Counter(roots)
     known = {root: k for k, root in enumerate((r for r in counts if counts[r] > 1), start=1)}
     return [known.get(root, 0) for root in roots]

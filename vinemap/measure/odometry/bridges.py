@@ -11,7 +11,7 @@ from vinemap.measure.odometry.trials import path, views
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
 from vinemap.odometry.sensors.bridging import bridged, joined
-from vinemap.odometry.sensors.fixes import Places
+from vinemap.odometry.sensors.fixes import Fixes
 from vinemap.odometry.sensors.wheels import Odometer, Wheels
 from vinemap.odometry.track import follow
 from vinemap.simulate.camera import LOW
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Values
     from vinemap.odometry.poses import Pose
-    from vinemap.odometry.track import Fix
+    from vinemap.odometry.track import TrackPoint
 
 LOST, STRETCHES = 0.2, 4
 """Share of a path's frames that show nothing, and in how many stretches they are."""
@@ -62,14 +62,14 @@ def bridges(
         frames = [Frame(str(i), float(times[i]), None if lost[i] else image) for i, image in enumerate(seen)]
         odometer = Odometer(wheels_of(true, rng))
         ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, ACCURACY, (2, 2))
-        places = Places(times[[0, -1]], ends, np.full(2, ACCURACY))
+        fixes = Fixes(times[[0, -1]], ends, np.full(2, ACCURACY))
         alone, driven = (list(follow(iter(frames), camera=LOW, sensor=sensor)) for sensor in (None, odometer))
         tracks = {
             "the last movement": alone,
             "steps beside them": bridged(alone),
             "wheels": bridged(driven, odometer),
-            "fixes at both ends": joined(alone, places).fixes,
-            "wheels, fixes at both ends": joined(driven, places, odometer).fixes,
+            "fixes at both ends": joined(alone, fixes).track,
+            "wheels, fixes at both ends": joined(driven, fixes, odometer).track,
         }
         for name, track in tracks.items():
             found.setdefault(name, []).append(_off(track, true))
@@ -99,6 +99,6 @@ def wheels_of(poses: Sequence[Pose], rng: np.random.Generator) -> Wheels:
     return Wheels(PERIOD * np.arange(n), speeds, rates)
 
 
-def _off(track: Sequence[Fix], true: Sequence[Pose]) -> Values:
+def _off(track: Sequence[TrackPoint], true: Sequence[Pose]) -> Values:
     """Millimetres (n,) by which poses are off."""
-    return np.array([np.hypot(*np.subtract(fix.pose[:2], pose[:2])) for fix, pose in zip(track, true, strict=True)])
+    return np.array([np.hypot(*np.subtract(point.pose[:2], pose[:2])) for point, pose in zip(track, true, strict=True)])

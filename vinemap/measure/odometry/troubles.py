@@ -83,13 +83,13 @@ def drive(trouble: Trouble, ground: str | Path, n: int, *, seed: int = 0) -> tup
 
 def outcome(images: Sequence[Image], poses: Sequence[Pose], repeated: Sequence[bool]) -> Outcome:
     """Follow a drive, and hold every step that is believed against the truth."""
-    fixes = list(follow((Frame(str(k), None, image) for k, image in enumerate(images)), camera=LOW, foresight=MEMORY))
+    track = list(follow((Frame(str(k), None, image) for k, image in enumerate(images)), camera=LOW, foresight=MEMORY))
     believed = wrong = 0
-    for k, fix in enumerate(fixes):
-        if fix.measured_from is None:
+    for k, point in enumerate(track):
+        if point.measured_from is None:
             continue
-        step = moved(fixes[fix.measured_from].pose, fix.pose)
-        off = template_error(step, moved(poses[fix.measured_from], poses[k]), LOW)
+        step = moved(track[point.measured_from].pose, point.pose)
+        off = template_error(step, moved(poses[point.measured_from], poses[k]), LOW)
         believed += not repeated[k]
         wrong += off > FAILURE
     return Outcome(len(images) - 1 - sum(repeated), believed, wrong)

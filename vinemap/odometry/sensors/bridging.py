@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from vinemap.compute.arrays import Ints, Values
-    from vinemap.odometry.sensors.fixes import Places
+    from vinemap.odometry.sensors.fixes import Fixes
     from vinemap.odometry.sensors.wheels import Odometer
-    from vinemap.odometry.track import Fix
+    from vinemap.odometry.track import TrackPoint
 
 AROUND = 4
 """Steps at either side of a gap, at most, that tell those within."""
@@ -53,7 +53,7 @@ class _Known(NamedTuple):
     """What most of them took."""
 
 
-def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]:
+def bridged(track: Sequence[TrackPoint], odometer: Odometer | None = None) -> list[TrackPoint]:
     """A track whose stretches are joined by the likeliest steps across the gaps between them.
 
     Each part of a step, ahead, to the left and its turn, is that of wheels, or of a spline through the steps beside the
@@ -63,50 +63,50 @@ def bridged(fixes: Sequence[Fix], odometer: Odometer | None = None) -> list[Fix]
 
     Parameters
     ----------
-    fixes : sequence of Fix
+    track : sequence of TrackPoint
         Of a whole recording, as :func:`vinemap.odometry.track.follow` tells them.
     odometer : Odometer, optional
         The sensor of that, which has learned of all frames.
     """
-    numbers = stretches(fixes)
-    known = _known(fixes, numbers, odometer)
+    numbers = stretches(track)
+    known = _known(track, numbers, odometer)
     in_stretches = [(k, number) for k, number in enumerate(numbers) if number]
-    measured = [np.diag(fix.of_step) for fix in fixes if fix.motion] or [np.zeros(3)]
+    measured = [np.diag(point.of_step) for point in track if point.motion] or [np.zeros(3)]
     surest = np.median(measured, axis=0)
     steps: dict[int, tuple[Pose, Values]] = {}
     for (before, stretch), (after, next_stretch) in pairwise(in_stretches):
         found = _crossing(known, before, after) if stretch != next_stretch else None
         if found is None:
             continue
-        lost = after - before > 1 and all(fix.flag in UNSEEN for fix in fixes[before + 1 : after])
+        lost = after - before > 1 and all(point.flag in UNSEEN for point in track[before + 1 : after])
         told, variance = found
         for k, step in enumerate(told, start=before + 1):
             late = np.where(np.isnan(known.driven[k]), max(known.seconds[k] / known.period, 1), 1)
-            least = surest if lost else np.diag(fixes[k].of_step) * late**2
+            least = surest if lost else np.diag(track[k].of_step) * late**2
             steps[k] = Pose(*map(float, step)), np.diag(np.maximum(variance, least))
-    return _carried(fixes, steps)
+    return _carried(track, steps)
 
 
-def joined(fixes: Sequence[Fix], places: Places, odometer: Odometer | None = None) -> Pulled:
-    """A track that is bridged and pulled to places, or pulled as it was where they contradict what bridges it.
+def joined(track: Sequence[TrackPoint], fixes: Fixes, odometer: Odometer | None = None) -> Pulled:
+    """A track that is bridged and pulled to fixes, or pulled as it was where they contradict what bridges it.
 
     Parameters are as of :func:`bridged` and :func:`vinemap.odometry.sensors.pulling.pulled`.
     """
-    found = pulled(bridged(fixes, odometer), places)
+    found = pulled(bridged(track, odometer), fixes)
     if found.fits and not found.left_out:
         return found
-    return min(found, pulled(fixes, places), key=lambda track: (track.left_out, not track.fits))
+    return min(found, pulled(track, fixes), key=lambda one: (one.left_out, not one.fits))
 
 
-def _known(fixes: Sequence[Fix], numbers: Sequence[int], odometer: Odometer | None) -> _Known:
-    seen, driven = np.full((2, len(fixes), 3), np.nan)
-    seconds = np.full(len(fixes), np.nan)
-    for k, (before, fix) in enumerate(pairwise(fixes), start=1):
+def _known(track: Sequence[TrackPoint], numbers: Sequence[int], odometer: Odometer | None) -> _Known:
+    seen, driven = np.full((2, len(track), 3), np.nan)
+    seconds = np.full(len(track), np.nan)
+    for k, (before, point) in enumerate(pairwise(track), start=1):
         if numbers[k] and numbers[k] == numbers[k - 1]:
-            seen[k] = moved(before.pose, fix.pose)
-        if fix.time is not None and before.time is not None:
-            seconds[k] = fix.time - before.time
-        if odometer and (told := odometer.between(before.time, fix.time, UNTOLD)):
+            seen[k] = moved(before.pose, point.pose)
+        if point.time is not None and before.time is not None:
+            seconds[k] = point.time - before.time
+        if odometer and (told := odometer.between(before.time, point.time, UNTOLD)):
             driven[k] = told[0]
     timed = seconds > 0
     period = float(np.median(seconds[timed])) if timed.any() else 1.0
@@ -168,19 +168,19 @@ def _alike(untold: Ints, before: int, steps: Ints, apart: int) -> Ints:
     return np.sort(found[np.argsort(np.abs(found - before), kind="stable")][:WINDOWS])
 
 
-def _carried(fixes: Sequence[Fix], steps: Mapping[int, tuple[Pose, Values]]) -> list[Fix]:
+def _carried(track: Sequence[TrackPoint], steps: Mapping[int, tuple[Pose, Values]]) -> list[TrackPoint]:
     """The track with other steps, and covariances of them, to some of its poses from those before."""
-    out: list[Fix] = []
-    for k, fix in enumerate(fixes):
-        if fix.motion is not None and fix.measured_from is not None:
-            anchor, step, of_step = out[fix.measured_from], fix.motion.movement, fix.of_step
+    out: list[TrackPoint] = []
+    for k, point in enumerate(track):
+        if point.motion is not None and point.measured_from is not None:
+            anchor, step, of_step = out[point.measured_from], point.motion.movement, point.of_step
         elif k in steps:
             anchor, (step, of_step) = out[k - 1], steps[k]
         elif steps and k > min(steps):
-            anchor, step, of_step = out[k - 1], moved(fixes[k - 1].pose, fix.pose), fix.of_step
+            anchor, step, of_step = out[k - 1], moved(track[k - 1].pose, point.pose), point.of_step
         else:
-            out.append(fix)
+            out.append(point)
             continue
         pose, covariance = onward(anchor.pose, step), onward_covariance(anchor.pose, anchor.covariance, step, of_step)
-        out.append(fix._replace(pose=pose, covariance=covariance, of_step=of_step))
+        out.append(point._replace(pose=pose, covariance=covariance, of_step=of_step))
     return out

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from vinemap.compute.arrays import Flags, Values
-    from vinemap.odometry.track import Fix
+    from vinemap.odometry.track import TrackPoint
 
 
 def read_table(path: Path) -> tuple[pd.DataFrame, Values]:
@@ -49,9 +49,9 @@ def go_on(times: Values, kept: Values) -> Flags:
     return np.asarray(times > before)
 
 
-def check_times(path: Path, times: Values, fixes: Sequence[Fix]) -> None:
+def check_times(path: Path, times: Values, track: Sequence[TrackPoint]) -> None:
     """Raise InputError if a file has nothing of the time of a recording."""
-    known = [fix.time for fix in fixes if fix.time is not None]
+    known = [point.time for point in track if point.time is not None]
     if len(known) < 2:
         raise InputError(f"{path}: can't be used, as the frames have no times: name images by them")
     if times.max() < min(known) or times.min() > max(known):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PLACES = ("lat", "lon", "accuracy_m")
 
 
-class Places(NamedTuple):
+class Fixes(NamedTuple):
     """Where a robot's centre was at times, in mm in its frame at the start, (n, 2), and standard deviations (n,)."""
 
     times: Values
@@ -28,7 +28,7 @@ class Places(NamedTuple):
     sd: Values
 
 
-def read_places(path: Path, start: Start) -> tuple[Places, int]:
+def read_fixes(path: Path, start: Start) -> tuple[Fixes, int]:
     """Read satellite fixes from a CSV, and tell how many lines were left out.
 
     Raises
@@ -48,4 +48,4 @@ def read_places(path: Path, start: Start) -> tuple[Places, int]:
     east, north, _ = wgs84_to_main(degrees, Origin(start.lat, start.lon, 0.0)).T
     a = np.radians(start.heading_deg)
     xy = 1000 * np.column_stack([east * np.sin(a) + north * np.cos(a), north * np.sin(a) - east * np.cos(a)])
-    return Places(times[kept], xy, 1000 * accuracy[kept]), int(len(times) - kept.sum())
+    return Fixes(times[kept], xy, 1000 * accuracy[kept]), int(len(times) - kept.sum())

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vinemap.compute.arrays import Flags, Values
-    from vinemap.odometry.sensors.fixes import Places
-    from vinemap.odometry.track import Fix
+    from vinemap.odometry.sensors.fixes import Fixes
+    from vinemap.odometry.track import TrackPoint
 
 START_MM, START_DEG = 1000.0, 10.0
 """Standard deviations of a start where fixes know better."""
@@ -29,56 +29,56 @@ PRIOR = np.array([1 / START_MM, 1 / START_MM, 1 / np.radians(START_DEG)])
 FAR = 4.0
 """Standard deviations from the track from which on a fix is left out."""
 LIKELY = 0.999
-"""Probability of an error that is no larger, from which on steps and places contradict each other."""
+"""Probability of an error that is no larger, from which on steps and fixes contradict each other."""
 
 
 class Pulled(NamedTuple):
-    """A track that was pulled to places."""
+    """A track that was pulled to fixes."""
 
-    fixes: list[Fix]
+    track: list[TrackPoint]
     left_out: int
-    """Places that don't count."""
+    """Fixes that don't count."""
     fits: bool
-    """Whether steps and places contradict each other no more than they err by what is said of them."""
+    """Whether steps and fixes contradict each other no more than they err by what is said of them."""
 
 
-def pulled(fixes: Sequence[Fix], places: Places) -> Pulled:
-    """A track with the poses and covariances that fit steps and places best.
+def pulled(track: Sequence[TrackPoint], fixes: Fixes) -> Pulled:
+    """A track with the poses and covariances that fit steps and fixes best.
 
-    Places that lie far from where all others put the robot don't count, nor those beside the recording.
+    Fixes that lie far from where all others put the robot don't count, nor those beside the recording.
     """
-    poses = np.array([fix.pose for fix in fixes])
+    poses = np.array([point.pose for point in track])
     poses[:, 2] = np.radians(poses[:, 2])
-    at, weight, used = _frames_at(places, fixes)
+    at, weight, used = _frames_at(fixes, track)
     unit = np.array([1, 1, np.radians(1)])
-    start = np.arange(len(fixes)) - 1
-    ends = [(start[k] if fix.measured_from is None else fix.measured_from, k) for k, fix in enumerate(fixes)][1:]
+    start = np.arange(len(track)) - 1
+    ends = [(start[k] if point.measured_from is None else point.measured_from, k) for k, point in enumerate(track)][1:]
     links = np.array(ends, int).reshape(-1, 2)
-    steps = [fixes[j].motion.movement if fixes[j].motion else moved(fixes[i].pose, fixes[j].pose) for i, j in links]
-    sure = [np.linalg.cholesky(np.linalg.inv(unit[:, None] * fixes[j].of_step * unit)).T for _, j in links]
+    steps = [track[j].motion.movement if track[j].motion else moved(track[i].pose, track[j].pose) for i, j in links]
+    sure = [np.linalg.cholesky(np.linalg.inv(unit[:, None] * track[j].of_step * unit)).T for _, j in links]
     graph = _Graph(links, np.array(steps).reshape(-1, 3) * unit, np.array(sure).reshape(-1, 3, 3), at, weight)
     way = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-    kept = used & (np.hypot(*places.xy.T) < 2 * way + FAR * (START_MM + places.sd))
+    kept = used & (np.hypot(*fixes.xy.T) < 2 * way + FAR * (START_MM + fixes.sd))
     at_first = poses
     for _ in range(int(used.sum()) + 1):
-        poses, misfit = _solved(at_first, graph, places, kept)
-        off = np.hypot(*(_place_at(poses, at, weight) - places.xy).T) / places.sd
+        poses, misfit = _solved(at_first, graph, fixes, kept)
+        off = np.hypot(*(_place_at(poses, at, weight) - fixes.xy).T) / fixes.sd
         worst = int(np.argmax(np.where(kept, off, 0)))
         if not kept[worst] or off[worst] <= FAR or kept.sum() <= 1:
             break
         kept[worst] = False
-    covariances = _covariances(poses, graph, places, kept) / unit[:, None] / unit
+    covariances = _covariances(poses, graph, fixes, kept) / unit[:, None] / unit
     poses[:, 2] = np.degrees(poses[:, 2])
     out = [
-        fix._replace(pose=Pose(*map(float, pose)), covariance=covariance)
-        for fix, pose, covariance in zip(fixes, poses, covariances, strict=True)
+        point._replace(pose=Pose(*map(float, pose)), covariance=covariance)
+        for point, pose, covariance in zip(track, poses, covariances, strict=True)
     ]
     fits = not kept.any() or chdtr(2 * kept.sum(), misfit) <= LIKELY  # chi-squared
     return Pulled(out, int(len(kept) - kept.sum()), bool(fits))
 
 
 class _Graph(NamedTuple):
-    """Steps (n, 3) from poses to others (n, 2), square roots of their information; frames at places, and shares."""
+    """Steps (n, 3) from poses to others (n, 2), square roots of their information; frames at fixes, and shares."""
 
     links: Values
     steps: Values
@@ -87,14 +87,14 @@ class _Graph(NamedTuple):
     weight: Values
 
 
-def _frames_at(places: Places, fixes: Sequence[Fix]) -> tuple[Values, Values, Values]:
+def _frames_at(fixes: Fixes, track: Sequence[TrackPoint]) -> tuple[Values, Values, Values]:
     """The frame before each place in time, how far it is on to the next, and whether there are both."""
-    told = np.array([k for k, fix in enumerate(fixes) if fix.time is not None])
-    times = np.maximum.accumulate([fixes[k].time for k in told])
-    after = np.clip(np.searchsorted(times, places.times, "right"), 1, len(times) - 1)
-    share = (places.times - times[after - 1]) / np.maximum(times[after] - times[after - 1], 1e-9)
+    told = np.array([k for k, point in enumerate(track) if point.time is not None])
+    times = np.maximum.accumulate([track[k].time for k in told])
+    after = np.clip(np.searchsorted(times, fixes.times, "right"), 1, len(times) - 1)
+    share = (fixes.times - times[after - 1]) / np.maximum(times[after] - times[after - 1], 1e-9)
     period = float(np.median(np.diff(times))) or 1.0
-    near = (places.times >= times[0] - period) & (places.times <= times[-1] + period)
+    near = (fixes.times >= times[0] - period) & (fixes.times <= times[-1] + period)
     return np.column_stack([told[after - 1], told[after]]), np.clip(share, 0, 1), near
 
 
@@ -102,7 +102,7 @@ def _place_at(poses: Values, at: Values, weight: Values) -> Values:
     return poses[at[:, 0], :2] * (1 - weight[:, None]) + poses[at[:, 1], :2] * weight[:, None]
 
 
-def _solved(poses: Values, graph: _Graph, places: Places, kept: Flags) -> tuple[Values, float]:
+def _solved(poses: Values, graph: _Graph, fixes: Fixes, kept: Flags) -> tuple[Values, float]:
     """Poses by Gauss–Newton, and what is left of all squared errors over their variances."""
     poses = poses.copy()
     first = poses[0].copy()
@@ -119,12 +119,12 @@ def _solved(poses: Values, graph: _Graph, places: Places, kept: Flags) -> tuple[
         ]
         entries.append((3 * n + np.arange(3), np.arange(3), PRIOR))
         entries += [
-            (under, (3 * at[:, [end]] + np.arange(2)).reshape(-1), np.repeat(part / places.sd[kept], 2))
+            (under, (3 * at[:, [end]] + np.arange(2)).reshape(-1), np.repeat(part / fixes.sd[kept], 2))
             for end, part in ((0, 1 - weight), (1, weight))
         ]
         row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
         slopes = coo_matrix((value, (row, column)), shape=(3 * n + 3 + 2 * len(at), poses.size)).tocsc()
-        misses = (_place_at(poses, at, weight) - places.xy[kept]) / places.sd[kept, None]
+        misses = (_place_at(poses, at, weight) - fixes.xy[kept]) / fixes.sd[kept, None]
         residuals = np.concatenate([off.reshape(-1), PRIOR * (poses[0] - first), misses.reshape(-1)])
         normal = slopes.T @ slopes
         scale = 1 / np.sqrt(normal.diagonal())  # unknowns alike
@@ -150,10 +150,10 @@ def _linear(poses: Values, graph: _Graph) -> tuple[Values, Values, Values]:
     return np.einsum("nij,nj->ni", graph.sure, off), graph.sure @ of_i, graph.sure @ of_j
 
 
-def _covariances(poses: Values, graph: _Graph, places: Places, kept: Flags) -> Values:
+def _covariances(poses: Values, graph: _Graph, fixes: Fixes, kept: Flags) -> Values:
     """Covariances (n + 1, 3, 3) of poses in mm and radians.
 
-    As each pose has one step to it, the graph is a tree but for places between two frames, which count for the nearer
+    As each pose has one step to it, the graph is a tree but for fixes between two frames, which count for the nearer
     one: what is known of a pose comes from the leaves up, and of the rest down from the root. D. Koller and
     N. Friedman, Probabilistic Graphical Models, 2009, chapter 10.
     """
@@ -161,7 +161,7 @@ def _covariances(poses: Values, graph: _Graph, places: Places, kept: Flags) -> V
     known[0] = np.diag(PRIOR**2)
     nearer = np.where(graph.weight[kept] < 0.5, *graph.frames[kept].T)
     for axis in range(2):
-        np.add.at(known[:, axis, axis], nearer, places.sd[kept] ** -2.0)
+        np.add.at(known[:, axis, axis], nearer, fixes.sd[kept] ** -2.0)
     _, above, below = _linear(poses, graph)
     turned, parents = above.transpose(0, 2, 1), graph.links[:, 0]
     own, cross, passed = below.transpose(0, 2, 1) @ below, turned @ below, turned @ above
