@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from scipy.ndimage import gaussian_filter1d
 
+from vinemap.geo.curve import at, way_along
 from vinemap.simulate.terrain import Array, Terrain, waves
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def vines_along(vineyard: Vineyard, length: float) -> Array:
 
 def dead_vines_of(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[np.bool_]]:
     """Which vines of every row are dead; never a row's first or last, so that rows end where they say."""
-    counts = [len(vines_along(vineyard, reached(row)[-1])) for row in vineyard.rows]
+    counts = [len(vines_along(vineyard, way_along(row)[-1])) for row in vineyard.rows]
     dead = [rng.random(n) < vineyard.dead for n in counts]
     order = rng.permutation(len(counts))
     for k, run in enumerate(vineyard.gaps):
@@ -106,7 +107,7 @@ def dead_vines_of(vineyard: Vineyard, rng: np.random.Generator) -> list[NDArray[
         dead[i][start : start + run] = True
     for row, vines in zip(vineyard.rows, dead, strict=True):
         if vineyard.bare:
-            vines[shapely.contains_xy(vineyard.bare, at(row, vines_along(vineyard, reached(row)[-1])))] = True
+            vines[shapely.contains_xy(vineyard.bare, at(row, vines_along(vineyard, way_along(row)[-1])))] = True
         vines[[0, -1]] = False
     return dead
 
@@ -123,7 +124,7 @@ def grow(
         for side in ((0.0,) if vineyard.curtains is None else (vineyard.curtains / 2, -vineyard.curtains / 2))
     ]
     for k, vineyard, row, side, vines in lines:
-        length = reached(row)[-1]
+        length = way_along(row)[-1]
         step = length / math.ceil(length / STATION)
         arc = (np.arange(-BARE, round(length / step) + BARE) + 0.5) * step
         n, ends = len(arc), np.diff(row[[0, 1, -2, -1]], axis=0)[::2]
@@ -206,16 +207,6 @@ def foliage_outlines(foliage: Foliage, *, n: int = 24) -> Array:
     left = np.stack([foliage.shift[:, None] + width, z], axis=2)
     right = np.stack([foliage.shift[:, None] - width, z], axis=2)
     return np.concatenate([left, right[:, ::-1]], axis=1)
-
-
-def reached(row: Array) -> Array:
-    """Distance (n,) of a polyline's vertices from its start."""
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(row, axis=0), axis=1)))
-
-
-def at(row: Array, distance: Array) -> Array:
-    """Points (m, 2) of a polyline at distances from its start."""
-    return np.column_stack([np.interp(distance, reached(row), coordinate) for coordinate in row.T])
 
 
 def on_ground(row: Array, distance: Array, terrain: Terrain) -> Array:

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import shapely
 
-from vinemap.simulate.plants import Stations, Vineyard, on_ground, reached, vines_along
+from vinemap.geo.curve import way_along
+from vinemap.simulate.plants import Stations, Vineyard, on_ground, vines_along
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,12 +28,12 @@ def truth_of(
     rows, spots, gaps = [], [], []
     plots = [(vineyard, i, row) for vineyard in vineyards for i, row in enumerate(vineyard.rows, 1)]
     for k, ((vineyard, i, row), vines) in enumerate(zip(plots, dead, strict=True)):
-        name, length = vineyard.name, reached(row)[-1]
+        name, length = vineyard.name, way_along(row)[-1]
         line = on_ground(row, np.linspace(0, length, math.ceil(length / 0.25) + 1), terrain)
         own = (stations.row == k) & (stations.arc > 0) & (stations.arc < length)
         alive = own & (stations.half_width > 0)
         height, width = stations.top[alive].mean(), 2 * stations.half_width[alive].mean() + (vineyard.curtains or 0)
-        rows.append((name, i, reached(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
+        rows.append((name, i, way_along(line)[-1], len(vines), vines.sum(), height, width, shapely.LineString(line)))
         gone = np.flatnonzero(vines)
         middles = vines_along(vineyard, length)[gone]
         points = on_ground(row, middles, terrain)

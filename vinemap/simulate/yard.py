@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.simulate.plants import at, reached
+from vinemap.geo.curve import at, way_along
 from vinemap.simulate.rays import Obstacle
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ def posts(rows: Sequence[Array], *, every: float = POSTS, top: float = 2.0, beyo
     """Posts of 8 cm in rows, every so many metres; the outermost stand ``beyond`` m outside of the rows' ends."""
     spots = []
     for row in rows:
-        length = reached(row)[-1]
-        ends = row[[0, -1]] + beyond * (row[[0, -1]] - row[[1, -2]]) / reached(row)[1]
+        length = way_along(row)[-1]
+        ends = row[[0, -1]] + beyond * (row[[0, -1]] - row[[1, -2]]) / way_along(row)[1]
         spots += [*ends, *at(row, np.linspace(0, length, max(round(length / every), 1) + 1)[1:-1])]
     return [Obstacle(x, y, 0.04, 0.04, top, solid=True) for x, y in spots]
 
