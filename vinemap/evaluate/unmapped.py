@@ -20,7 +20,7 @@ from vinemap.surfaces.statistics import LOWEST
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Floats
 
-TALL, WIDE, LOW, UNSEEN, ALONE = "too tall", "too wide", "too low", "no rows seen", "alone"
+TALL, WIDE, LOW, ROWLESS, ALONE = "too tall", "too wide", "too low", "no rows seen", "alone"
 """Reasons for which something is in no row."""
 HALF = 0.5
 """Share of the rows' height below which what stands beside them is no vine of their age."""
@@ -197,7 +197,7 @@ def _places(chm: Raster, away: Floats, usual: Usual, tallest: float) -> list[dic
             if low and (width > usual.width + cell or not row):
                 continue
             beside = across > width + usual.spacing / 2 or (row and bool(np.isfinite(away[window][stand]).any()))
-            why = reason or (LOW if low else UNSEEN if beside else ALONE)
+            why = reason or (LOW if low else ROWLESS if beside else ALONE)
             polygon = _polygon(place, chm.grid, window, hole=usual.widest**2)
             shape = {"area_m2": float(shapely.area(polygon)), "geometry": polygon}
             found.append(shape | {"reason": why, "height_m": height, "width_m": width})

@@ -9,12 +9,12 @@ import shapely
 
 from vinemap.compute.beside import nearest_beside
 from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
-from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
+from vinemap.evaluate.unmapped import ALONE, LOW, ROWLESS, TALL, WIDE
 from vinemap.geo.crs import project
 from vinemap.geo.curve import at_each, tangents_of_each
 from vinemap.geo.raster import block_sum, cell_of
 from vinemap.rows.curtains import CLOSE
-from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
+from vinemap.rows.standing.gaps import UNSEEN
 from vinemap.surfaces.statistics import LOWEST
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def _reasons(unmapped: gpd.GeoDataFrame) -> str:
         TALL: "too tall for vines (up to {height_m:.0f} m)",
         WIDE: "closed over {width_m:.0f} m, so that no rows can be told",
         LOW: "lower than half of the rows ({height_m:.1f} m)",
-        UNSEEN: "like vines, but no rows were seen",
+        ROWLESS: "like vines, but no rows were seen",
         ALONE: "alone",
     }
     main = areas[areas >= MAIN * areas.sum()]
@@ -240,7 +240,7 @@ def sight_notices(rows: gpd.GeoDataFrame, row_ends: gpd.GeoDataFrame) -> list[st
         With ``row_id`` and ``beyond``.
     """
     hidden, n = rows["unseen_m"].to_numpy(dtype=float), len(rows)
-    of, open_ones = np.count_nonzero(hidden), row_ends.loc[row_ends["beyond"] == NOT_SEEN, "row_id"].nunique()
+    of, open_ones = np.count_nonzero(hidden), row_ends.loc[row_ends["beyond"] == UNSEEN, "row_id"].nunique()
     remarks = {
         f"{hidden.sum():.1f} m of {of} of {n} rows were not seen: whether vines stand there is not known, and none is "
         "counted as missing": of > 0,

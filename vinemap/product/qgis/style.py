@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from vinemap.evaluate.unmapped import ALONE, LOW, TALL, UNSEEN, WIDE
+from vinemap.evaluate.unmapped import ALONE, LOW, ROWLESS, TALL, WIDE
 from vinemap.evaluate.vines import VINE, WEAK
 from vinemap.product.qgis.symbology import (
     by_value,
@@ -23,8 +23,7 @@ from vinemap.product.qgis.symbology import (
     rgba,
     single,
 )
-from vinemap.rows.standing.gaps import MISSING
-from vinemap.rows.standing.gaps import UNSEEN as NOT_SEEN
+from vinemap.rows.standing.gaps import MISSING, UNSEEN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -90,9 +89,9 @@ LIKELIHOODS = ("#ffffff", "#fee8c8", "#fdbb84", "#e34a33", "#7f0000")
 DIRECTIONS = ("#e0558d", "#e88a3c", "#b3b43a", "#4bb56b", "#3aa7c4", "#7377d9", "#e0558d")
 """A round of colours, as 180° is 0°."""
 CANOPY = ("#ccd9bf", "#ccd9bf", "#a9c19b", "#84a67c", "#5f8a61", "#3c6a4b")
-REASONS = {UNSEEN: "#c2185b", ALONE: "#ef6fa5", LOW: "#f0a202", WIDE: "#96582a", TALL: "#566a8c"}
+REASONS = {ROWLESS: "#c2185b", ALONE: "#ef6fa5", LOW: "#f0a202", WIDE: "#96582a", TALL: "#566a8c"}
 """Colours of what is in no row, by the reason."""
-VINES = {VINE: INK, WEAK: "#f0a202", MISSING: RED, NOT_SEEN: GREY}
+VINES = {VINE: INK, WEAK: "#f0a202", MISSING: RED, UNSEEN: GREY}
 """Colours of vines, by what stands in their places."""
 CATEGORIES = {"unmapped": ("reason", REASONS), "vines": ("state", VINES)}
 LOWEST_CANOPY, HIGHEST_CANOPY = 0.5, 2.5
@@ -118,7 +117,7 @@ SYMBOLS = {
         [{"style": "no", "outline_color": rgba("#5b3f8c"), "outline_width": "0.6", "outline_style": "dash"}],
     ),
 }
-GAPS = {MISSING: {"line_color": rgba(RED)}, NOT_SEEN: {"line_color": rgba(GREY)}}
+GAPS = {MISSING: {"line_color": rgba(RED)}, UNSEEN: {"line_color": rgba(GREY)}}
 FLAGGED = "if(\"flag\" = '', 0, 1)"
 MEASURED_OR_NOT = [(-0.5, 0.5, "measured", TRACK), (0.5, 1.5, "flagged", RED)]
 SMALLEST_SCALE = {"sections": 800, "vines": 800, "key_points": 1500, "row_ends": 4000, "poses": 500}
