@@ -63,6 +63,21 @@ def test_names_of_parcels(tmp_path, columns, names):
         assert read_boundary(path, parcel=name)[0].equals(square)
 
 
+@pytest.mark.parametrize(
+    ("written", "stated"), [("UTF-8", None), ("UTF-8", "1252"), ("CP1252", None), ("CP1252", "UTF-8")]
+)
+def test_names_in_a_shapefile_whatever_it_states_of_its_encoding(tmp_path, written, stated):
+    path = tmp_path / "b.shp"
+    names = ["Höhe", "Süd"]
+    gpd.GeoDataFrame({"name": names}, geometry=[shapely.box(k, 0, k + 0.9, 1) for k in (0, 1)], crs=32632).to_file(
+        path, encoding=written
+    )
+    path.with_suffix(".cpg").unlink()
+    if stated:
+        path.with_suffix(".cpg").write_text(stated)
+    assert list(read_parcels(path)) == names
+
+
 def test_no_column_names_each_parcel(tmp_path):
     path, _ = polygons(tmp_path / "b.gpkg", name=["A", "A", "C"], plot=["P", None, "Q"])
     with pytest.raises(InputError, match=r"b\.gpkg: no column has a name of its own for each of its 3 polygons"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zipfile
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ ZIPPED = (".shp", ".gpkg", ".geojson", ".kml")
 """Files of layers in a ``.zip``."""
 WHOLE = 2**53
 """Number from which on not every whole one has a float."""
+ENCODINGS: tuple[str | None, ...] = ("UTF-8", None, "CP1252")
+"""How the words of a Shapefile may be written, which often states nothing of it, or something else (None)."""
 MOST_NAMED = 5
 """Things that are named where many are left out."""
 
@@ -44,6 +47,9 @@ class Layer(NamedTuple):
         """What it holds."""
         import geopandas as gpd  # a quarter of a second of start-up, needed for people's files only
 
+        for encoding in ENCODINGS if self.source.lower().endswith(".shp") else ():
+            with suppress(UnicodeDecodeError):
+                return gpd.read_file(self.source, layer=self.name, encoding=encoding)
         return gpd.read_file(self.source, layer=self.name)
 
 
