@@ -255,6 +255,20 @@ def test_a_surface_model_is_a_point_a_pixel(tmp_path):
     assert np.array_equal(read_cloud(path).xyz, cloud.xyz)
 
 
+@pytest.mark.parametrize(
+    ("unit", "crs", "corner", "metres"),
+    [("ft", 32632, (414_700, 4_940_700, 0), 0.3048), ("metre", 2226, (6_475_000, 1_907_000, 0), 1.0)],
+)
+def test_heights_of_a_surface_model_are_in_the_unit_that_it_states(tmp_path, unit, crs, corner, metres):
+    xyz = np.array([[0.1, 0.1, 600], [0.6, 0.1, 700]]) + corner
+    path = formats.write_surface(tmp_path / "a.tif", xyz, CRS.from_epsg(crs), resolution=0.5)
+    with rasterio.open(path, "r+") as raster:
+        raster.units = (unit,)
+    assert sorted(read_cloud(path).xyz[:, 2]) == pytest.approx([600 * metres, 700 * metres])
+    given = read_cloud(path, crs=CRS.from_user_input(f"EPSG:{crs}+6360"))
+    assert sorted(given.xyz[:, 2]) == pytest.approx([600 * 1200 / 3937, 700 * 1200 / 3937])
+
+
 def test_a_photograph_is_no_surface_model(tmp_path):
     how = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": 4, "height": 4, "crs": UTM.to_wkt()}
     with rasterio.open(tmp_path / "a.tif", "w", transform=rasterio.Affine(1, 0, 0, 0, -1, 9), **how):

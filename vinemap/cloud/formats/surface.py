@@ -9,6 +9,8 @@ import numpy as np
 from vinemap.cloud.formats.box import box_about
 from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
 from vinemap.errors import InputError
+from vinemap.geo.crs import vertical, vertical_unit
+from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -22,6 +24,12 @@ if TYPE_CHECKING:
 
 LOWEST, HIGHEST = -1_000.0, 30_000.0
 """Metres or feet between which all land lies: what is beyond stands for nothing."""
+UNITS = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "foot_us"), 1200 / 3937),
+}
+"""Metres of the units in which a raster may state its values to be."""
 
 
 def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
@@ -49,21 +57,25 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
             np.append(corners.max(axis=0), np.nan),
             point_count=raster.width * raster.height,
         )
+        unit = UNITS.get((raster.units[0] or "").strip().lower())
     remark = (
         f"{path.name} is a surface model, which shows canopies from above alone: their meshes reach down to the soil, "
         "where foliage begins isn't known (bottom_m, lwa_m2_ha), and volumes are of what was seen"
     )
-    return Points(header, _read(path, box_about(around, header, crs, path)), (remark,), steps=False)
+    source = crs_of(header, crs, path)
+    size = unit / vertical_unit(source) if unit and not vertical(source) else 1.0
+    return Points(header, _read(path, box_about(around, header, crs, path), size), (remark,), steps=False)
 
 
-def _read(path: Path, box: Box) -> Generator[Floats]:
+def _read(path: Path, box: Box, size: float) -> Generator[Floats]:
+    """Points (n, 3) of what meets a box, chunk by chunk; ``size`` is that of the raster's unit in that of heights."""
     import rasterio
 
     with rasterio.open(path) as raster:
         first, last, left, right = _part(raster, box)
     rows = max(1, CHUNK // max(1, right - left))
     for row in range(first, last, rows):
-        yield _strip(path, row, min(rows, last - row), left, right - left)
+        yield _strip(path, row, min(rows, last - row), left, right - left) * [1.0, 1.0, size]
 
 
 def _strip(path: Path, row: int, rows: int, column: int, columns: int) -> Floats:
