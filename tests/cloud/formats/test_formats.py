@@ -269,6 +269,14 @@ def test_heights_of_a_surface_model_are_in_the_unit_that_it_states(tmp_path, uni
     assert sorted(given.xyz[:, 2]) == pytest.approx([600 * 1200 / 3937, 700 * 1200 / 3937])
 
 
+def test_zeros_of_a_surface_model_are_land_only_beside_land_at_sea_level(tmp_path):
+    xyz = np.array([[0.1, 0.1, 0.0], [0.6, 0.1, 0.0], [0.1, 0.6, 8], [0.6, 0.6, 3]]) + [414_700, 4_940_700, 0]
+    assert len(read_cloud(formats.write_surface(tmp_path / "a.tif", xyz, UTM, resolution=0.5)).xyz) == 4
+    xyz[2:, 2] += 400
+    inland = read_cloud(formats.write_surface(tmp_path / "b.tif", xyz, UTM, resolution=0.5))
+    assert sorted(inland.xyz[:, 2]) == [403, 408]
+
+
 def test_a_photograph_is_no_surface_model(tmp_path):
     how = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": 4, "height": 4, "crs": UTM.to_wkt()}
     with rasterio.open(tmp_path / "a.tif", "w", transform=rasterio.Affine(1, 0, 0, 0, -1, 9), **how):

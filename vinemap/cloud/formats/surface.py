@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 LOWEST, HIGHEST = -1_000.0, 30_000.0
 """Metres or feet between which all land lies: what is beyond stands for nothing."""
+NEAR_ZERO = 10.0
+"""Metres or feet from 0 beyond which land lies where 0 stands for nothing, as rasters without nodata are filled up."""
+NEAREST = 0.01
+"""Share of the land's pixels that may lie nearer, as those blended with the filling do."""
 UNITS = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
@@ -87,6 +91,9 @@ def _strip(path: Path, row: int, rows: int, column: int, columns: int) -> Floats
     with rasterio.open(path) as raster:
         heights = raster.read(1, window=window).astype(float) * raster.scales[0] + raster.offsets[0]
         seen = (raster.read_masks(1, window=window) > 0) & (heights > LOWEST) & (heights < HIGHEST)
+        land = np.abs(heights[seen & (heights != 0)])
+        if len(land) == 0 or np.quantile(land, NEAREST) > NEAR_ZERO:
+            seen &= heights != 0
         i, j = np.nonzero(seen)
         return usable(np.column_stack([_placed(raster, i + row + 0.5, j + column + 0.5), heights[i, j]]))
 
