@@ -54,6 +54,12 @@ def polygons(path, **columns):
         ({"name": ["A", None, None], "plot": ["P", "Q", "R"]}, ["P", "Q", "R"]),
         ({"name": ["123/4", "123/5", " 123/6  b"]}, ["123/4", "123/5", "123/6 b"]),
         ({"id": [7.0, 8.0, 9.0]}, ["7", "8", "9"]),
+        ({"superficie": [364, 171, 169], "nombre": ["A", "B", "C"]}, ["A", "B", "C"]),
+        (
+            {"uuid": [f"{k}f2504e0-4f89-41d3-9a0c-0305e82c3301" for k in "123"], "Lage": ["A", "B", "C"]},
+            ["A", "B", "C"],
+        ),
+        ({"ha": [0.5, 1.5, 2.25], "no": [7, 8, 9]}, ["7", "8", "9"]),
     ],
 )
 def test_names_of_parcels(tmp_path, columns, names):
@@ -82,10 +88,19 @@ def test_no_column_names_each_parcel(tmp_path):
     path, _ = polygons(tmp_path / "b.gpkg", name=["A", "A", "C"], plot=["P", None, "Q"])
     with pytest.raises(InputError, match=r"b\.gpkg: no column has a name of its own for each of its 3 polygons"):
         read_parcels(path)
+    measured, _ = polygons(tmp_path / "m.gpkg", name=["A", "A", "C"], hectares=[0.5, 1.5, 2.5])
+    with pytest.raises(InputError, match="no column has a name of its own"):
+        read_parcels(measured)
     bare = tmp_path / "bare.geojson"
     gpd.GeoDataFrame(geometry=[shapely.box(0, 0, 1, 1)], crs=32632).to_file(bare)
     with pytest.raises(InputError, match="no column has a name"):
         read_parcels(bare)
+
+
+def test_parcels_tell_where_another_column_than_the_likeliest_names_them(tmp_path):
+    path, _ = polygons(tmp_path / "b.gpkg", name=["North", "South", "North"], id=[7, 8, 9])
+    (remark,) = read_parcels(path)["8"].remarks
+    assert remark == "it is called after column 'id', as 'North' stands more than once in 'name'"
 
 
 def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):

@@ -11,12 +11,12 @@ import numpy as np
 import shapely
 
 from vinemap.errors import InputError
-from vinemap.geo.crs import metric_crs, project
+from vinemap.geo.crs import project
 from vinemap.geo.layers import KML, kind_of, parts_of, polygons_of, read_layers, some_of, words_of
 from vinemap.geo.place import check_place
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     import geopandas as gpd
@@ -31,6 +31,10 @@ AREAS, OTHERS = ("Polygon", "Surface"), ("Point", "LineString", "Curve", "None")
 """What kinds of layers are called that hold polygons, and that hold none; in the rest there may be some."""
 WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
 """Columns that are likely to name polygons, the likeliest first, and such as number them."""
+HALF = 0.5
+"""Share of the polygons that have a name, from which on the others lack one."""
+LONGEST_WORD = 31
+"""Letters of a name beyond which it may be an identifier that a program gave."""
 OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
 OF_KML |= {"draworder", "icon", "snippet"}
 """Columns of every KML, which name nothing."""
@@ -133,6 +137,7 @@ def read_parcels(
         raise InputError(f"{path}: no column has a name of its own for each of its {n} polygons: add one, 'name'")
     found: dict[str, Parcel | InputError] = {}
     column, words = next(iter(table.columns.items()))
+    remarks = _called_otherwise(table)
     for row, (word, unnamed) in enumerate(zip(words, words.isna(), strict=True)):
         name = f"polygon {row + 1}" if unnamed else str(word)
         if not table.area[row]:
@@ -140,8 +145,23 @@ def read_parcels(
         elif unnamed:
             found[name] = InputError(f"{path}: {name} has no name in column {column!r}: give it one")
         else:
-            found[name] = _made(table, np.array([row]), path)
+            made = _made(table, np.array([row]), path)
+            found[name] = made._replace(remarks=(*made.remarks, *remarks)) if isinstance(made, Parcel) else made
     return found
+
+
+def _called_otherwise(table: _Table) -> list[str]:
+    """Why the column that is likely to name polygons doesn't, where one name in it is that of several."""
+    first, *others = table.columns
+    for name in others if first.lower() not in WORDS else ():
+        words = table.columns[name][table.area]
+        if (
+            name.lower() in WORDS
+            and words.notna().mean() >= HALF
+            and (twice := words[words.duplicated()].dropna()).size
+        ):
+            return [f"it is called after column {first!r}, as {twice.iloc[0]!r} stands more than once in {name!r}"]
+    return []
 
 
 def _places(table: _Table) -> list[dict[str, NDArray[np.int_]]]:
@@ -237,7 +257,11 @@ def _read_table(path: Path, *, local: bool = False) -> _Table:
     if not area.any():
         raise InputError(f"{path}: holds no polygon")
     columns = {str(name): words_of(frame[name]) for name in frame.columns if name != frame.geometry.name}
-    ranks = {name: _rank(name, words[area]) for name, words in columns.items() if name.lower() not in OF_KML}
+    ranks = {
+        name: _rank(name, words[area], measured=_is_measured(frame[name]))
+        for name, words in columns.items()
+        if name.lower() not in OF_KML
+    }
     usable = min(ranks.values(), default=USELESS) < USELESS
     return _Table(frame, area, {name: columns[name] for name in sorted(ranks, key=ranks.__getitem__)}, usable)
 
@@ -245,17 +269,26 @@ def _read_table(path: Path, *, local: bool = False) -> _Table:
 USELESS = (9, 0)
 
 
-def _rank(column: str, words: pd.Series) -> tuple[int, int]:
+def _rank(column: str, words: pd.Series, *, measured: bool) -> tuple[int, int]:
     """How well a column names polygons: the less, the better."""
     known, column = words.dropna(), column.lower()
     filled = len(known) / len(words)
-    kinds = [(WORDS, 1.0), (WORDS, 0.5), (NUMBERS, 1.0), ((column,), 1.0)]
+    kinds = [(WORDS, 1.0), (WORDS, HALF), (NUMBERS, 1.0)]
     if known.is_unique:
         for rank, (names, least) in enumerate(kinds):
             if column in names and filled >= least:
                 return rank, names.index(column)
+        if filled == 1.0 and not measured:
+            called = all(len(word) <= LONGEST_WORD and any(map(str.isalpha, word)) for word in known)
+            return len(kinds) + (not called), 0
     likely = (WORDS + NUMBERS).index(column) if column in WORDS + NUMBERS else 8
     return USELESS[0], likely
+
+
+def _is_measured(column: pd.Series) -> bool:
+    """Whether a column holds areas and the like, or times, which name nothing."""
+    kind = column.dtype.kind
+    return kind == "M" or (kind == "f" and bool((column.dropna() % 1 != 0).any()))
 
 
 def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
@@ -272,40 +305,6 @@ def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
         names = ", ".join(layer.name for layer in found)
         raise InputError(f"{path}: has several layers of polygons ({names}): save the parcels' alone")
     return named or found[:1]
-
-
-def points_near(
-    points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
-) -> dict[str, gpd.GeoSeries]:
-    """Those of some points that lie within each boundary, or no more than so many metres beside it.
-
-    Parameters
-    ----------
-    points : GeoSeries
-        Points in any CRS.
-    boundaries : mapping of str to Boundary
-        By the parcels' names; None is everywhere.
-    reach : float
-        Metres.
-
-    Raises
-    ------
-    InputError
-        If a boundary doesn't lie in its CRS, or nothing leads to that from the points'.
-    """
-    found: dict[str, gpd.GeoSeries] = {}
-    brought: dict[CRS, shapely.STRtree] = {}
-    for name, boundary in boundaries.items():
-        if not boundary:
-            found[name] = points
-            continue
-        polygon, own = boundary
-        crs = metric_crs(own, *shapely.get_coordinates(shapely.point_on_surface(polygon))[0])
-        if crs not in brought:
-            brought[crs] = shapely.STRtree(project(points.to_numpy(), points.crs, crs))
-        near = brought[crs].query(project(polygon, own, crs), predicate="dwithin", distance=reach)
-        found[name] = points.iloc[np.sort(near)]
-    return found
 
 
 def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:

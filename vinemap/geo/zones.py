@@ -8,14 +8,18 @@ import numpy as np
 import shapely
 
 from vinemap.compute.compiled import compiled
+from vinemap.geo.crs import metric_crs, project
 from vinemap.geo.raster import Grid, cell_at, window
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    import geopandas as gpd
     from numpy.typing import NDArray
+    from pyproj import CRS
 
     from vinemap.compute.arrays import Floats, Ints
+    from vinemap.geo.boundaries import Boundary
 
     Labels = NDArray[np.int32]
 
@@ -134,3 +138,37 @@ def _copy(xyz: Floats, p: int, out: Floats, place: Ints, zone: int) -> None:
     at = place[zone]
     out[at, 0], out[at, 1], out[at, 2] = xyz[p, 0], xyz[p, 1], xyz[p, 2]
     place[zone] = at + 1
+
+
+def points_near(
+    points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
+) -> dict[str, gpd.GeoSeries]:
+    """Those of some points that lie within each boundary, or no more than so many metres beside it.
+
+    Parameters
+    ----------
+    points : GeoSeries
+        Points in any CRS.
+    boundaries : mapping of str to Boundary
+        By the parcels' names; None is everywhere.
+    reach : float
+        Metres.
+
+    Raises
+    ------
+    InputError
+        If a boundary doesn't lie in its CRS, or nothing leads to that from the points'.
+    """
+    found: dict[str, gpd.GeoSeries] = {}
+    brought: dict[CRS, shapely.STRtree] = {}
+    for name, boundary in boundaries.items():
+        if not boundary:
+            found[name] = points
+            continue
+        polygon, own = boundary
+        crs = metric_crs(own, *shapely.get_coordinates(shapely.point_on_surface(polygon))[0])
+        if crs not in brought:
+            brought[crs] = shapely.STRtree(project(points.to_numpy(), points.crs, crs))
+        near = brought[crs].query(project(polygon, own, crs), predicate="dwithin", distance=reach)
+        found[name] = points.iloc[np.sort(near)]
+    return found

@@ -17,9 +17,10 @@ from vinemap.cloud.formats.identity import digest_of, stamp_of
 from vinemap.cloud.pdal.engine import made_by
 from vinemap.config.settings import Settings
 from vinemap.errors import PASSING, BusyError, InputError
-from vinemap.geo.boundaries import points_near, read_parcel
+from vinemap.geo.boundaries import read_parcel
 from vinemap.geo.crs import is_local
 from vinemap.geo.layers import read_points, some_of
+from vinemap.geo.zones import points_near
 from vinemap.product.qgis.changed import changed
 
 if TYPE_CHECKING:
