@@ -159,3 +159,13 @@ def test_a_parcel_that_is_called_as_its_cloud_takes_the_only_polygon_and_says_so
     for parcel, boundary in (("south", one), ("north", two)):
         with pytest.raises(InputError, match=r"has '(south|north)' in a column"):
             recipe_of(cloud, parcel=parcel, boundary=boundary)
+
+
+@pytest.mark.parametrize("year", [1980, 2999])
+def test_a_date_that_no_flight_can_have_is_none(tmp_path, year):
+    """Of a header, and of the file."""
+    path = write_las(tmp_path / "a.las", date=datetime(year, 5, 1, tzinfo=UTC))
+    os.utime(path, (1_700_000_000, 1_700_000_000))
+    assert recipe.flown(recipe.read_source(path)) == datetime.fromtimestamp(1_700_000_000, UTC)
+    os.utime(path, (4_000_000_000, 4_000_000_000))
+    assert recipe.flown(recipe.read_source(path)) <= datetime.now(UTC)

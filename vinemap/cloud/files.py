@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 CLOUDS = (".las", ".laz", *IN_FOLDERS)
 """How files end that are clouds wherever they lie; others, as text and surface models, are if they are named."""
 COPC = ".copc.laz"
+FIRST_YEAR, AHEAD = 2003, timedelta(days=1)
+"""Year since which there is LAS, and how far a day's date may be ahead of the clock, as east of Greenwich."""
 
 
 def listed(clouds: Path | Sequence[Path]) -> tuple[Path, ...]:
@@ -123,7 +125,7 @@ def _head(path: Path) -> Head | None:
 
 
 def date_of(path: Path) -> datetime | None:
-    """Midnight (UTC) of the day that a file's header states as its date; None if it states none.
+    """Midnight (UTC) of the day that a file's header states as its date; None if it states none that can be.
 
     Raises
     ------
@@ -138,9 +140,10 @@ def date_of(path: Path) -> datetime | None:
     if len(head) < 94 or not head.startswith(b"LASF"):
         return None
     day, year = struct.unpack("<HH", head[90:])
-    return (
-        datetime(year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1) if 1 <= day <= 366 and 1970 < year < 9999 else None
-    )
+    if not (1 <= day <= 366 and FIRST_YEAR <= year < 9999):
+        return None
+    date = datetime(year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1)
+    return date if date < datetime.now(UTC) + AHEAD else None
 
 
 def _rank(path: Path) -> tuple[bool, bool, bool]:

@@ -280,7 +280,7 @@ def vines_of(points: gpd.GeoSeries, parcels: Mapping[str, Boundary | None]) -> d
 
 
 def flown(cloud: Source) -> datetime:
-    """When a cloud's survey was flown: the date in its header, or else when the file was written.
+    """When a cloud's survey was flown: the date in its header, or else when the file was written, but not after now.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def flown(cloud: Source) -> datetime:
         If it can't be read.
     """
     try:
-        return date_of(cloud.path) or datetime.fromtimestamp(cloud.stamp[1] // 10**9, UTC)
+        return date_of(cloud.path) or min(datetime.fromtimestamp(cloud.stamp[1] // 10**9, UTC), datetime.now(UTC))
     except OSError as error:
         raise _unreadable(cloud.path, error) from error
 
