@@ -56,11 +56,12 @@ def needs_points(one, folder, *, piece=None, **options):
     return doubles.follow(one, folder, piece=piece, **options)
 
 
-def test_one_parcel_that_is_not_in_the_cloud_alone(job, monkeypatch):
+def test_a_survey_of_which_no_parcel_is_in_the_cloud_fails(job, monkeypatch):
     monkeypatch.setattr(survey, "follow", needs_points)
     job.draw(away=50)
-    assert job.states() == {"away": OUTSIDE}
-    assert job.states() == {"away": OUTSIDE}
+    outcomes = job.run()
+    assert "none of its parcels lies in the cloud" in outcomes["parcels.geojson"].line()
+    assert job.states() == {"away": OUTSIDE, "parcels.geojson": FAILED}
     assert job.worked == []
 
 

@@ -170,6 +170,15 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     return plan
 
 
+def elsewhere(config: SurveyConfig, outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """What is to be told where all parcels lie beside the cloud."""
+    if {one.state for one in outcomes} - {LEFT, GONE} != {OUTSIDE}:
+        return []
+    boundaries = config.boundaries or paths.survey_boundaries(config.survey)
+    reason = "none of its parcels lies in the cloud: do both show the same place, in the right CRS?"
+    return [Outcome(boundaries.name, FAILED, reason=reason)]
+
+
 def _named(parcels: Mapping[str, Parcel | None], *, caseless: bool) -> tuple[dict[str, Parcel | None], list[Outcome]]:
     """Parcels whose names can name folders, each another, and what is to be known of the rest."""
     named: dict[str, Parcel | None] = {}

@@ -18,7 +18,7 @@ from vinemap.cloud.pdal.engine import check_engines
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
-from vinemap.jobs.plan import DONE, FAILED, LEFT, OUTSIDE, Outcome, Plan, plan_survey, write_record
+from vinemap.jobs.plan import DONE, FAILED, LEFT, OUTSIDE, Outcome, Plan, elsewhere, plan_survey, write_record
 from vinemap.jobs.register import is_due, note
 from vinemap.jobs.workers import Worker, Workers
 from vinemap.parcel import follow
@@ -98,6 +98,7 @@ def map_survey(
             yield from _noted(plan.settled, outcomes)
             if plan.recipes:
                 yield from _noted(_work(plan, config, folder, aside, step), outcomes)
+            yield from _noted(elsewhere(config, outcomes), outcomes)
             yield from _noted(_register(plan, config, folder, outcomes), outcomes)
         except InputError as error:
             done = {outcome.parcel for outcome in outcomes}
