@@ -189,6 +189,13 @@ def test_local_metres_are_read_as_they_are(tmp_path, points):
     assert cloud.remarks == ()
 
 
+@pytest.mark.parametrize(("keys", "told"), [(STATE_PLANE, True), (STATE_PLANE | {4099: 9003}, False), (UTM, False)])
+def test_feet_that_nothing_states_are_told(tmp_path, points, keys, told):
+    place = NAPA if keys == UTM else np.array([6_475_700, 1_907_700, 0])
+    remarks = read_cloud(write(tmp_path / "a.laz", points + place, keys=keys)).remarks
+    assert any("heights are taken to be in US survey foot" in one for one in remarks) == told
+
+
 def test_remarks_stay_with_the_points(tmp_path, points):
     cloud = read_cloud(write(tmp_path / "a.laz", points + [1_600_000, 4_940_000, 0], crs=3003))
     assert len(cloud.remarks) == 1

@@ -12,7 +12,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
 from vinemap.errors import GridError, InputError
-from vinemap.geo.crs import LOCAL, WGS84, code_of, horizontal, is_local, stated, transformer
+from vinemap.geo.crs import LOCAL, WGS84, code_of, horizontal, is_local, stated, transformer, vertical
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,6 +112,14 @@ def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
         known = f"{own.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
         return [] if own == LOCAL else [known]
     return [*_roughness(flat, x, y), *_other_shift(own, flat, x, y)]
+
+
+def doubts_of_heights(crs: CRS) -> list[str]:
+    """Whether heights are taken to be in a unit that isn't the metre, for want of one that is stated: a sentence."""
+    axis = crs.axis_info[0]
+    if vertical(crs) or len(crs.axis_info) > 2 or not crs.is_projected or axis.unit_conversion_factor == 1.0:
+        return []
+    return [f"heights are taken to be in {axis.unit_name}, as x and y are: if they aren't, --crs EPSG:n+m tells it"]
 
 
 def doubts_of_given(given: CRS, own: CRS, x: float, y: float, of: str) -> list[str]:

@@ -24,7 +24,7 @@ from vinemap.geo.crs import (
     vertical_name,
     vertical_unit,
 )
-from vinemap.geo.place import GLOBE, OTHER_PLACE, apart, check_place, doubts_of, doubts_of_given
+from vinemap.geo.place import GLOBE, OTHER_PLACE, apart, check_place, doubts_of, doubts_of_given, doubts_of_heights
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -244,7 +244,8 @@ def examined(xyz: Floats, header: Any, source: CRS, path: Path, *, given: bool =
     x, y = np.median(sample[:, :2], axis=0).tolist()
     check_place(source, x, y, str(path))
     check_steps(sample, len(xyz), header, source, path)
-    return [*_overridden(header, source, x, y, path), *doubts_of(source, x, y)] if given else doubts_of(source, x, y)
+    doubts = [*doubts_of(source, x, y), *doubts_of_heights(source)]
+    return [*_overridden(header, source, x, y, path), *doubts] if given else doubts
 
 
 def _overridden(header: Any, given: CRS, x: float, y: float, path: Path) -> list[str]:

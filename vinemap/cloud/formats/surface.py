@@ -10,6 +10,7 @@ from vinemap.cloud.formats.box import box_about
 from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
 from vinemap.errors import InputError
 from vinemap.geo.crs import vertical, vertical_unit
+from vinemap.geo.place import doubts_of_heights
 from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
@@ -68,7 +69,8 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     )
     source = crs_of(header, crs, path)
     size = unit / vertical_unit(source) if unit and not vertical(source) else 1.0
-    return Points(header, _read(path, box_about(around, header, crs, path), size), (remark,), steps=False)
+    remarks = remark, *(() if unit else doubts_of_heights(source))
+    return Points(header, _read(path, box_about(around, header, crs, path), size), remarks, steps=False)
 
 
 def _read(path: Path, box: Box, size: float) -> Generator[Floats]:
