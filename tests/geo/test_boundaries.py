@@ -97,10 +97,12 @@ def test_no_column_names_each_parcel(tmp_path):
         read_parcels(bare)
 
 
-def test_parcels_tell_where_another_column_than_the_likeliest_names_them(tmp_path):
+def test_a_name_that_several_polygons_have_is_told(tmp_path):
     path, _ = polygons(tmp_path / "b.gpkg", name=["North", "South", "North"], id=[7, 8, 9])
     (remark,) = read_parcels(path)["8"].remarks
     assert remark == "it is called after column 'id', as 'North' stands more than once in 'name'"
+    (remark,) = read_parcel(path, parcel="North").remarks
+    assert remark == "2 polygons of b.gpkg are called 'North', and count as one parcel"
 
 
 def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):

@@ -179,7 +179,9 @@ def _found(
     if rows is None and len(table.frame) == 1 and not _is_named(table, word):
         rows = np.arange(1)
     if rows is not None:
-        return _made(table, rows, path)
+        made, n = _made(table, rows, path), np.count_nonzero(table.area[rows])
+        told = f"{n} polygons of {path.name} are called {name!r}, and count as one parcel"
+        return made if isinstance(made, InputError) or n < 2 else made._replace(remarks=(*made.remarks, told))
     if lone and len(table.frame) == 1:
         made = _made(table, np.arange(1), path)
         told = f"the only polygon of {path.name} was taken, though none of its columns says {name!r}"
