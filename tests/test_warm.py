@@ -49,7 +49,7 @@ def test_the_command_says_what_it_did_and_where(tmp_path):
 def test_a_cache_that_cannot_be_written(monkeypatch):
     monkeypatch.setattr(compiled, "_folder", lambda: (None, False))
     assert "nothing can be kept" in warm.warm().line()
-    with warm.ahead(print) as step:
+    with warm.warming(print) as step:
         assert step is print
 
 
@@ -66,13 +66,13 @@ def cold(monkeypatch, tmp_path):
 
 
 def test_a_stage_waits_for_what_is_compiled_beside(cold):
-    with warm.ahead(lambda name, function: function()) as step:
+    with warm.warming(lambda name, function: function()) as step:
         assert not step("Reading", cold.exists)
         assert step("Sections", cold.exists)
 
 
 def test_what_is_compiled_beside_ends_with_the_run(cold):
-    with pytest.raises(KeyboardInterrupt), warm.ahead(print):
+    with pytest.raises(KeyboardInterrupt), warm.warming(print):
         raise KeyboardInterrupt
     time.sleep(0.5)
     assert not cold.exists()
@@ -80,5 +80,5 @@ def test_what_is_compiled_beside_ends_with_the_run(cold):
 
 def test_on_one_core_all_is_compiled_where_it_is_needed(cold, monkeypatch):
     monkeypatch.setattr(machine, "cores", lambda: 1)
-    with warm.ahead(lambda name, function: function()) as step:
+    with warm.warming(lambda name, function: function()) as step:
         assert not step("Sections", cold.exists)

@@ -61,7 +61,7 @@ def warm() -> Warmth:
 
 
 @contextmanager
-def ahead(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
+def warming(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
     """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits, at a stage, for what is compiled meanwhile.
 
     Where something is kept already, all is taken to be.

@@ -58,7 +58,7 @@ def run(
     from vinemap.errors import OutputError
     from vinemap.geo.crs import parse_crs
     from vinemap.product.recipe import made_of
-    from vinemap.warm import ahead
+    from vinemap.warm import warming
 
     files = cloud_files(clouds)
     survey = paths.named_by(files)
@@ -79,7 +79,7 @@ def run(
         "origin": origin,
         "named": parcel is not None,
     }
-    with progress(name) as bar, ahead(bar) as step:
+    with progress(name) as bar, warming(bar) as step:
         from vinemap.parcel import map_parcel
 
         summary = map_parcel(clouds, folder, parcel=name, step=step, **options)

@@ -12,7 +12,7 @@ import shapely
 
 from vinemap.export.neighbours import STEP, aligned, belonging, look, pair_rows
 from vinemap.geo.curve import extend, way_along
-from vinemap.geo.holes import across, comes_back, room_before
+from vinemap.geo.holes import comes_back, room_before, way_out
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -219,7 +219,7 @@ def _inside(
         row = lines[(right or left)[0]]
         foot = shapely.get_coordinates(shapely.line_interpolate_point(row, shapely.line_locate_point(row, _points(xy))))
         away = (xy - foot) / np.maximum(np.hypot(*(xy - foot).T), 1e-9)[:, None]
-        rays = np.asarray(shapely.linestrings(np.stack([foot, xy + across(within) * away], axis=1)), dtype=object)
+        rays = np.asarray(shapely.linestrings(np.stack([foot, xy + way_out(within) * away], axis=1)), dtype=object)
         free |= ~comes_back(rays, within)
     if free.all():
         yield right, left, course
@@ -238,7 +238,7 @@ def _lead_out(xy: Floats, free: Flags, longest: float, within: shapely.Geometry)
     if last < 0 or len(beyond) < 2 or way_along(beyond)[-1] > longest:
         return
     outward = (beyond[-1] - beyond[0]) / np.hypot(*(beyond[-1] - beyond[0]))
-    line = shapely.LineString([*beyond, beyond[-1] + across(within) * outward])
+    line = shapely.LineString([*beyond, beyond[-1] + way_out(within) * outward])
     free[last:] = not comes_back(np.array([line], dtype=object), within)[0]
 
 

@@ -32,13 +32,13 @@ def room_before(place: Values, way: Values, polygon: shapely.Geometry) -> float:
     """Metres from a place (2,) along a unit vector (2,) to a hole or notch of the polygon, of several the nearest."""
     point, parts = shapely.Point(place), shapely.get_parts(polygon)
     part = parts[int(np.argmin(shapely.distance(parts, point)))]
-    far = place + (across(part) + float(shapely.distance(part, point))) * way
+    far = place + (way_out(part) + float(shapely.distance(part, point))) * way
     outside = shapely.get_parts(shapely.difference(shapely.LineString([place, far]), part))
     holes = outside[shapely.distance(outside, shapely.Point(far)) > 0]
     return float(np.min(shapely.distance(holes, point), initial=np.inf))
 
 
-def across(polygon: shapely.Geometry) -> float:
+def way_out(polygon: shapely.Geometry) -> float:
     """Metres that lead out of a polygon from any place in it."""
     west, south, east, north = shapely.bounds(polygon).tolist()
     return float(np.hypot(east - west, north - south)) + 1

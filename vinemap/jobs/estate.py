@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import naming, paths
 from vinemap.cloud.files import CLOUDS, cloud_files, is_cloud, once, tiles_in
-from vinemap.cloud.formats.identity import parts_of
+from vinemap.cloud.formats.identity import files_of
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.las_end import unfinished
 from vinemap.config.names import check_name
@@ -180,7 +180,7 @@ def _whole(name: str, config: SurveyConfig, own: Path | None, estate: EstateConf
     used = [p for p in (*clouds, config.boundaries, config.rows, config.vines, own) if p]
     for file in used:
         _check(file)
-    age = min(_age(part, now, estate.settle) for p in used if not naming.url_of(p) for part in parts_of(p))
+    age = min(_age(part, now, estate.settle) for p in used if not naming.url_of(p) for part in files_of(p))
     if age < estate.settle:
         return Arrival(name, None, f"changed {age:.0f} s ago, waits until {estate.settle:.0f} s", waits=True)
     for cloud in clouds:
@@ -220,7 +220,7 @@ def _found(files: Iterable[Path], folder: Path | None) -> _Found:
 
 def _deeper(folder: Path, patterns: Sequence[str]) -> list[Path]:
     """Folders in a folder that hold clouds."""
-    tiles = {part for path in (folder, *folder.iterdir()) for part in parts_of(path / paths.EPT)}
+    tiles = {part for path in (folder, *folder.iterdir()) for part in files_of(path / paths.EPT)}
     clouds = (path for pattern in patterns for path in folder.glob(pattern) if is_cloud(path) and path not in tiles)
     shown = (path.parent for path in clouds if not any(p.startswith(".") for p in path.relative_to(folder).parts))
     return list(dict.fromkeys(shown))

@@ -28,7 +28,7 @@ def stamp_of(path: Path) -> tuple[int, ...]:
         file = Ranges(path)
         number = int.from_bytes(hashlib.sha256(file.tag.encode() + file.beginning).digest()[:7], "big")
         return file.size, _time_of(file.modified), 0, number
-    stats = [part.stat() for part in parts_of(path)]
+    stats = [part.stat() for part in files_of(path)]
     return (
         sum(stat.st_size for stat in stats),
         max(stat.st_mtime_ns for stat in stats),
@@ -60,7 +60,7 @@ def digest_of(path: Path) -> str:
         place = file.url.partition("?")[0]  # behind it may stand who asks, and until when
         told = f"{place} {file.size} {file.tag} {file.modified}".encode()
         return hashlib.sha256(told + file.beginning).hexdigest()
-    first, *others = parts_of(path)
+    first, *others = files_of(path)
     digests = [_sha256(first), *(f"{part.relative_to(path.parent).as_posix()} {_sha256(part)}" for part in others)]
     return hashlib.sha256("\n".join(digests).encode()).hexdigest() if others else digests[0]
 
@@ -70,7 +70,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def parts_of(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
     """Files of a cloud, of which EPT has many."""
     if kind_of(path) != "ept":
         return [path]
