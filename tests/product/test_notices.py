@@ -6,7 +6,14 @@ import pytest
 import shapely
 
 from vinemap.geo.raster import Grid, Raster
-from vinemap.product.notices import height_notices, known_notices, notices, pair_notices, sight_notices
+from vinemap.product.notices import (
+    ground_notices,
+    height_notices,
+    known_notices,
+    notices,
+    pair_notices,
+    sight_notices,
+)
 
 WEST, NORTH = 414_700.0, 4_940_760.0
 AREA = 60.0 * 40.0
@@ -274,3 +281,14 @@ def test_rows_that_stand_in_pairs():
 def test_rows_that_do_not(distances):
     assert pair_notices(side_by_side(*distances)) == []
     assert pair_notices(side_by_side()[:0]) == []
+
+
+@pytest.mark.parametrize(("reach", "told"), [(0.5, True), (0.9, False), (2.0, False)])
+def test_alleys_without_ground(reach, told):
+    """Canopies alone, canopies with a little of the ground beside them, and all."""
+    standing = side_by_side(2, 2, 2)
+    grid = Grid(WEST - 5, NORTH + 20, 0.25, 120, 160)
+    lines = shapely.union_all(standing.geometry.to_numpy())
+    near = shapely.dwithin(shapely.points(np.stack(np.meshgrid(*grid.centres()), axis=-1)), lines, reach)
+    remarks = ground_notices(standing.assign(spacing_m=2.0), Raster(np.where(near, 0.5, np.nan), grid, standing.crs))
+    assert [remark.startswith("alleys show ground on 0% of their length only") for remark in remarks] == [True] * told

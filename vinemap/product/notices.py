@@ -11,7 +11,7 @@ from vinemap.compute.beside import nearest_beside
 from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
 from vinemap.evaluate.unmapped import ALONE, LOW, ROWLESS, TALL, WIDE
 from vinemap.geo.crs import project
-from vinemap.geo.curve import at_each, tangents_of_each
+from vinemap.geo.curve import across, at_each, resample, tangents_of_each
 from vinemap.geo.raster import block_sum, cell_of
 from vinemap.rows.curtains import CLOSE
 from vinemap.rows.standing.gaps import UNSEEN
@@ -52,6 +52,8 @@ BESIDE, PARALLEL = 3.0, 0.95
 """Spacings within which rows stand beside each other, and cosine of the angle between them."""
 WIDEST, ALIKE, PAIRED = 1.8, 0.15, 0.5
 """Metres between two curtains of a row, at the most, share by which pairs' distances differ, and of rows in pairs."""
+MIDDLE, BARE = (0.35, 0.65), 0.5
+"""Spacings from a row between which the middle of an alley lies, and share of its length that shows ground mostly."""
 MAIN = 0.1
 """Share of what is in no row from which a reason is worth to be told."""
 
@@ -143,6 +145,32 @@ def pair_notices(rows: gpd.GeoDataFrame) -> list[str]:
     told = (
         f"rows stand in pairs, {apart:.1f} m apart and {beyond:.1f} m from the next ones: if each is a row of two "
         "curtains, known rows tell it (--rows)"
+    )
+    return [told]
+
+
+def ground_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
+    """That no ground is seen between rows, as where it was taken out of a cloud.
+
+    Parameters
+    ----------
+    rows : GeoDataFrame
+        LineString with ``spacing_m``.
+    chm : Raster
+        As of :func:`notices`.
+    """
+    beside, known, shares = np.linspace(*MIDDLE, 7), np.isfinite(chm.values).ravel(), []
+    for line, spacing in zip(rows.geometry, rows["spacing_m"].to_numpy(dtype=float), strict=True):
+        if np.isfinite(spacing):
+            curve = resample(shapely.get_coordinates(line), STEP)
+            xy = across(curve, spacing * np.concatenate([-beside, beside]), smoothing=SIDE)
+            shown = known[cell_of(xy.reshape(-1, 2), chm.grid)].reshape(xy.shape[:2])
+            shares.append(shown.any(axis=1).mean())
+    if not shares or (share := np.median(shares)) > BARE:
+        return []
+    told = (
+        f"alleys show ground on {share:.0%} of their length only: if it was taken out of the cloud, map the whole one, "
+        "as canopies are measured above the lowest that is left, and come out too low"
     )
     return [told]
 

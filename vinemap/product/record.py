@@ -14,6 +14,7 @@ from vinemap.evaluate.meshes import NUMBERS
 from vinemap.geo.place import doubts_of
 from vinemap.product.json_values import jsonable
 from vinemap.product.notices import (
+    ground_notices,
     height_notices,
     known_notices,
     notices,
@@ -130,6 +131,7 @@ def record_of(
         + notices(layers["rows"], chm, layers["parcel"], layers["unmapped"], points.size)
         + sight_notices(layers["rows"], layers["row_ends"])
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
+        + ground_notices(layers["rows"], chm)
         + ([] if recipe.known else pair_notices(layers["rows"]))
         + [SQUARE] * (square and not recipe.known),
         "versions": versions | made_by(recipe.settings.ground),
