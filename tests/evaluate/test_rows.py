@@ -248,6 +248,13 @@ def test_read_lines_of_one_parcel(tmp_path):
         read_lines(path, parcel="X")
 
 
+def test_read_lines_of_a_shapefile_that_misstates_its_encoding(tmp_path):
+    path = tmp_path / "rows.shp"
+    REFERENCE.assign(parcel="Süd").to_file(path, encoding="CP1252")
+    path.with_suffix(".cpg").write_text("UTF-8")
+    assert len(read_lines(path, parcel="Süd")) == len(REFERENCE)
+
+
 COMPOSED, APART = "Vigna L\u00e0", "Vigna La\u0300"
 
 

@@ -315,7 +315,7 @@ def read_lines(path: str | Path, layer: str | None = None, *, parcel: str | None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on a file's odd header
             layer = _line_layer(path, layer)
-            lines = gpd.read_file(path, layer=layer)
+            lines = Layer(str(path), layer, "").read()
     except (DataSourceError, DataLayerError, ShapelyError, OSError) as error:
         reason = str(error).split("; ", maxsplit=1)[0].replace("\n", " ")
         raise InputError(f"{path}: can't be read ({reason}); write it again as a GeoPackage, in QGIS say") from error
