@@ -52,8 +52,10 @@ BESIDE, PARALLEL = 3.0, 0.95
 """Spacings within which rows stand beside each other, and cosine of the angle between them."""
 WIDEST, ALIKE, PAIRED = 1.8, 0.15, 0.5
 """Metres between two curtains of a row, at the most, share by which pairs' distances differ, and of rows in pairs."""
-MIDDLE, BARE = (0.35, 0.65), 0.5
-"""Spacings from a row between which the middle of an alley lies, and share of its length that shows ground mostly."""
+MIDDLE, ON_ROW = (0.35, 0.65), np.array([-0.1, 0.0, 0.1])
+"""Spacings from a row between which the middle of an alley lies, and at which its canopy does."""
+BARE, POINTS = 0.5, 4
+"""Share of an alley's stretches that shows ground mostly, and cells of one that would, if points were as on the row."""
 MAIN = 0.1
 """Share of what is in no row from which a reason is worth to be told."""
 
@@ -160,12 +162,15 @@ def ground_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
         As of :func:`notices`.
     """
     beside, known, shares = np.linspace(*MIDDLE, 7), np.isfinite(chm.values).ravel(), []
+    offsets = np.concatenate([-beside, beside, ON_ROW])
     for line, spacing in zip(rows.geometry, rows["spacing_m"].to_numpy(dtype=float), strict=True):
         if np.isfinite(spacing):
             curve = resample(shapely.get_coordinates(line), STEP)
-            xy = across(curve, spacing * np.concatenate([-beside, beside]), smoothing=SIDE)
+            xy = across(curve, spacing * offsets, smoothing=SIDE)
             shown = known[cell_of(xy.reshape(-1, 2), chm.grid)].reshape(xy.shape[:2])
-            shares.append(shown.any(axis=1).mean())
+            middle, row = shown[:, : 2 * len(beside)], shown[:, 2 * len(beside) :]
+            apart = int(np.ceil(POINTS / (middle.shape[1] * max(row.mean(), 0.01))))
+            shares.append(np.logical_or.reduceat(middle.any(axis=1), np.arange(0, len(middle), apart)).mean())
     if not shares or (share := np.median(shares)) > BARE:
         return []
     told = (
