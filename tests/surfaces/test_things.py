@@ -38,6 +38,14 @@ def test_cars_and_pallets_are_flat(tall, size):
     assert not found[:100].any()
 
 
+def test_rows_that_touch_a_house_go_on_beyond_it():
+    heights, rng = field(every=40)
+    heights[20:60, 150:190] = 2.8 + rng.normal(0, 0.01, (40, 40))
+    found = flat(heights)
+    assert found[20:60, 150:190].all()
+    assert not found[:, :140].any()
+
+
 @pytest.mark.parametrize("width", [3, 4, 6, 8])
 @pytest.mark.parametrize("every", [None, 40])
 def test_trimmed_vines_are_long(width, every):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import binary_dilation, label
 
+from vinemap.compute.filters import distance_to
 from vinemap.compute.threads import in_threads, strips
 from vinemap.geo.raster import coarser, spread
 from vinemap.surfaces.statistics import LOWEST, usual_height
@@ -26,6 +27,8 @@ EVEN, AS_GROUND, EACH = 0.1, 2.0, 4
 of the ground, of which every so manyth row and column tells."""
 LEAST, MOST = 0.25, 0.5
 """Square metres that are flat in one piece, and share of a thing that such pieces are."""
+EDGE = 2.0
+"""Metres about what is flat that may be of the same thing, as windscreens are: vines that touch it reach farther."""
 LONG, FEW = 3.5, 0.5
 """Length of a thing in its own widths from which on it may be vines, and share of what stands that is flat, at most."""
 TALL, TALLER, TALLEST, TRUNK = 1.2, 1.5, 0.7, 1.0
@@ -67,13 +70,15 @@ def flat_things(chm: Raster, high: float) -> Flags:
     area[0] = 0.0
     if area.max() < LEAST:
         return out
-    smooth = binary_dilation((area >= LEAST)[places], BESIDE)[standing]
+    pieces = (area >= LEAST)[places]
+    smooth = binary_dilation(pieces, BESIDE)[standing]
     of = label(standing, BESIDE)[0][standing] - 1
     size = np.bincount(of)
     flat = np.bincount(of, smooth) >= MOST * size
     flat &= _shape(of, size, *np.nonzero(standing))[0] < LONG
     if size[flat].sum() <= FEW * len(of):
         out[standing] = flat[of]
+        out &= distance_to(pieces) * chm.grid.resolution <= EDGE
     return out
 
 
