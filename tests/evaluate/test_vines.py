@@ -48,7 +48,7 @@ def tables(rows, *, unseen=()):
         cover[np.ix_(np.abs(y - north) <= 0.25, canopy)] = 0.8
         stations = np.arange(STEP / 2, length, STEP)
         stations = stations[np.abs(stations[:, None] - there).min(axis=1) <= extent / 2]
-        sections += [(i, s, 1.8, 0.5, 0.7, 80) for s in stations]
+        sections += [(i, s, 1.8, 0.5, 0.7, 80, 0.4) for s in stations]
         edges = np.column_stack([there[:-1] + extent / 2, there[1:] - extent / 2])
         for a, b in edges[np.diff(edges, axis=1)[:, 0] > 0.8]:
             dark = ((place[hidden] > a) & (place[hidden] < b)).any()
@@ -57,7 +57,9 @@ def tables(rows, *, unseen=()):
     return (
         gpd.GeoDataFrame(pd.DataFrame(lines, columns=columns), crs=32632),
         gpd.GeoDataFrame(pd.DataFrame(gaps, columns=["row_id", "start_m", "end_m", "length_m", "n_missing", "state"])),
-        pd.DataFrame(sections, columns=["row_id", "position_m", "height_m", "width_m", "area_m2", "n_points"]),
+        pd.DataFrame(
+            sections, columns=["row_id", "position_m", "height_m", "width_m", "area_m2", "n_points", "extent_m"]
+        ),
         Raster(cover, grid, None),
     )
 
@@ -155,6 +157,16 @@ def test_what_was_not_seen_is_not_missing():
     assert own.loc[own["state"] == "unseen", "number"].tolist() == [k for _, k in unseen]
     assert own.loc[own["state"] == "unseen", ["height_m", "width_m", "volume_m3"]].isna().all(axis=None)
     assert out["n_missing"].tolist() == [gone.sum() for _, _, gone, *_ in rows]
+
+
+def test_where_canopy_has_few_points_one_vine_without_any_may_stand():
+    rows = planted(1.2, dead=0.0)
+    rows[2][2][7], rows[5][2][10:14] = True, True
+    told = tables(rows)
+    told[2][["n_points", "extent_m"]] = 20, 8.0
+    _, _, vines = find_vines(*told, vine_spacing=1.2)
+    gone = vines[vines["state"] == "missing"]
+    assert gone[["row_id", "number"]].to_numpy().tolist() == [[6, k] for k in (11, 12, 13, 14)]
 
 
 def test_canopies_of_vines_add_up_to_their_rows_and_weak_ones_are_told():

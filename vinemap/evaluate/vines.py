@@ -38,8 +38,8 @@ MODELLED = 0.6
 ridges alone."""
 EMPTY, CORE = 0.35, 0.3
 """Share of cover below which a vine is missing, and extents to both sides of its place in which it is looked for."""
-FEW = 8.0
-"""Points that a bare stretch would have, if it were canopy, from which it is one."""
+FEW = 4.0
+"""Points that a bare stretch would have, if it were canopy, from which it is one: 1 in 50 has none by chance."""
 HALF = 0.5
 """Share of the volume of the block's median vine below which one is weak."""
 
@@ -70,7 +70,8 @@ def find_vines(
     gaps : GeoDataFrame
         With ``row_id``, ``start_m``, ``end_m``, ``n_missing`` and ``state``.
     sections : GeoDataFrame
-        Sections of these rows, by row and ``position_m``, with ``height_m``, ``width_m``, ``area_m2``, ``n_points``.
+        Sections of these rows, by row and ``position_m``, with ``height_m``, ``width_m``, ``area_m2``, ``n_points``,
+        ``extent_m``.
     cover : Raster
         Canopy cover.
     vine_spacing : float, optional
@@ -140,7 +141,7 @@ def _stands(
     aside = np.linspace(-half, half, 2 * int(np.ceil(half / CELL)) + 1)
     covers = sample_across(cover, origin, np.column_stack([-along[:, 1], along[:, 0]]), aside).mean(axis=1)
     own = sections[sections["row_id"].isin(rows["row_id"])]
-    parts, points = dict(iter(own.groupby("row_id"))), own["n_points"].median()
+    parts, density = dict(iter(own.groupby("row_id"))), (own["n_points"] / own["extent_m"]).median()
     out = []
     profiles = np.split(covers, np.cumsum([len(station) for station in stations])[:-1])
     for i, length, station, profile, hidden in zip(rows["row_id"], lengths, stations, profiles, unseen, strict=True):
@@ -152,7 +153,7 @@ def _stands(
             canopy = np.where(share > MODELLED, np.maximum(canopy, share), canopy)
         bare = _bare_runs(canopy)
         edges = _edges(canopy, bare, float(length), hidden)
-        for start, end in bare[np.diff(bare, axis=1)[:, 0] * CELL * points < FEW]:
+        for start, end in bare[np.diff(bare, axis=1)[:, 0] * CELL * density < FEW]:
             canopy[start:end] = 1.0
         out.append(_Stand(edges, canopy))
     return out
