@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vinemap.geo.raster import Raster, grid_over
 from vinemap.rows.clusters import cluster_rows, ellipse_graph
+from vinemap.rows.pieces.joins import ends_of
 
 
 def literal_clusters(xy, direction, along, across):
@@ -275,3 +276,11 @@ def test_rows_do_not_go_through_houses(long, rows):
     heights[:, ::5] = np.nan  # where no point fell
     chm = Raster(heights, grid, 32632)
     assert cluster_rows(points, chm=chm)["cluster"].nunique() == rows
+
+
+def test_a_vine_by_itself_has_two_ends_however_its_points_lie():
+    """The first and the last of them on one side of its middle."""
+    xy = np.array([[0.4, -0.3], [0.0, 0.0], [0.9, 0.0], [0.42, 0.3]])
+    ends = ends_of(xy, np.zeros(4), np.full(4, 2.0), np.zeros(4, dtype=np.int64), np.array([0.0, 0.5, 0.9, 1.2]))
+    np.testing.assert_allclose(ends.tangent[0], -ends.tangent[1])
+    np.testing.assert_allclose(sorted(ends.xy[:, 0]), [0.0, 0.9])

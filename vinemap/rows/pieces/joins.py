@@ -52,11 +52,11 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
     for p in range(len(first) - 1):
         members = order[first[p] : first[p + 1]]
         s = position[members]
-        for end, depth in ((2 * p, s), (2 * p + 1, s[-1] - s)):
+        for end, depth, outer, inner in ((2 * p, s, 0, -1), (2 * p + 1, s[-1] - s, -1, 0)):
             near = members[depth <= TANGENT_LENGTH]
             middle = out.middle[end] = xy[near].mean(axis=0)
             x, y = (xy[near] - middle).T
-            outward = xy[members[depth.argmin()]] - middle
+            outward = xy[near[outer]] - xy[near[inner]]
             out.field[end] = _like(_axis(np.cos(2 * direction[near]).sum(), np.sin(2 * direction[near]).sum()), outward)
             axis = _axis(x @ x - y @ y, 2 * x @ y)
             tangent = _like(axis, outward) if s[-1] > SHORT else out.field[end]
