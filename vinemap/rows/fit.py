@@ -24,7 +24,7 @@ from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width,
 from vinemap.rows.standing.canopy import Standing, cut_to_canopy, find_canopy
 from vinemap.rows.standing.gaps import lay_out
 from vinemap.rows.standing.known_ends import Known, cut_as_known
-from vinemap.rows.standing.parting import part_rows
+from vinemap.rows.standing.parting import own_rows, part_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -130,20 +130,20 @@ def fit_rows(
         members = np.array(list(unended))
         curves = [smooth_course(curve, beyond=MARGIN) for curve in unended.values()]
     if settled := [of for _, of in looked_at if of]:
-        fits = dict(enumerate(cut_as_known([row for _, row in sorted(fits.items()) if row], settled)))
+        rows = dict(enumerate(cut_as_known([row for _, row in sorted(fits.items()) if row], settled)))
     else:
-        rows = {k: fit for k, fit in sorted(fits.items()) if fit}
+        rows = own_rows({k: fit for k, fit in sorted(fits.items()) if fit})
         spacing = courses["spacing_m"].to_numpy()[list(rows)]
         for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing, cover, margin=MARGIN).items():
             k, these = list(rows)[n], [course, *beside]
             like = np.full(len(these), k)
             dealt = _deal(cloud, vines, levels, these, half[like], curtains[like], [None] * len(these), high)
             share = next(share for group, shares in dealt for m, share in zip(group, shares, strict=True) if m == 0)
-            fits[k] = _fit(share, theirs=theirs, smoothing=smoothing, end_share=end_share) or fits[k]
+            rows[k] = _fit(share, theirs=theirs, smoothing=smoothing, end_share=end_share) or rows[k]
     standing = [
         (spacing, fit)
         for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True))
-        if (fit := fits[k]) and not (alone and fit.contrast < LEAST_CONTRAST)
+        if (fit := rows.get(k)) and not (alone and fit.contrast < LEAST_CONTRAST)
     ]
     return lay_out(standing, seen, dtm, within=within, min_gap=min_gap)
 

@@ -1,4 +1,4 @@
-"""Rows that run into one another where blocks abut are parted."""
+"""Rows that run into one another where blocks abut are parted, and what runs across rows is told from one."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ NEAR = 0.5
 """Spacings from another row's line within which none stands, and along a row over which it must be free of others."""
 GROUND = 0.35
 """Share of rows' usual cover up to which there is more ground than canopy."""
+MOST, ASLANT = 0.5, 0.5
+"""Share of what stands along a line that is others' canopy from which it is no row, and sine of the angle from which
+these run across it."""
 ENDS = (False, True)
 """A row's first end and its last."""
 
@@ -45,6 +48,26 @@ class _Tip(NamedTuple):
 
     past: float
     others: Ints
+
+
+def own_rows(rows: Mapping[int, Standing]) -> dict[int, Standing]:
+    """Rows but those of which most canopy is that of others across them, as along the ends of a block, shortest first.
+
+    Else these would lose their ends to what is no row.
+    """
+    standing, held = list(rows.values()), np.ones(len(rows), dtype=bool)
+    lines = np.array([shapely.LineString(row.curve) for row in standing], dtype=object)
+    chord = np.array([row.curve[-1] - row.curve[0] for row in standing]).reshape(-1, 2)
+    chord /= np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
+    canopies = shapely.buffer(lines, [row.half[1] for row in standing], cap_style="flat")
+    one, other = shapely.STRtree(canopies).query(lines, predicate="intersects")
+    across = np.abs(chord[one, 0] * chord[other, 1] - chord[one, 1] * chord[other, 0]) > ASLANT
+    one, other = one[across], other[across]
+    for k in sorted(set(one.tolist()), key=lambda k: standing[k].length):
+        own = shapely.union_all([shapely.LineString(between(standing[k].curve, *run)) for run in standing[k].runs])
+        theirs = shapely.union_all(canopies[other[(one == k) & held[other]]])
+        held[k] = shapely.intersection(own, theirs).length < MOST * own.length
+    return {k: row for (k, row), own in zip(rows.items(), held, strict=True) if own}
 
 
 def part_rows(rows: Sequence[Standing], spacing: Values, cover: Raster, *, margin: float) -> dict[int, Parted]:
