@@ -184,3 +184,12 @@ def test_a_bush_as_long_as_a_row_is_none():
     assert len(fit_to(courses, bush)[0]) == 0
     row = scene([np.array([[0, 0], [12.0, 0]])], width=0.7)
     assert len(fit_to(courses, row)[0]) == 1
+
+
+def test_a_row_goes_on_where_it_is_faint():
+    """As where only its ridge counts: for ten metres its cover is a third."""
+    found = scene([np.array([[0.0, y], [40.0, y]]) for y in (0.0, 2.5, 5.0)])
+    x, _ = found.cover.grid.centres()
+    found.cover.values[:, x > 30] *= 0.35
+    courses = trace_rows(found.key_points, found.cover)
+    assert shapely.bounds(courses.geometry.to_numpy())[:, 2] == pytest.approx(40.0, abs=0.3)
