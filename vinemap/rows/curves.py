@@ -20,7 +20,7 @@ from vinemap.compute.threads import in_threads
 from vinemap.geo.curve import between, extend, normals, resample
 from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import centre_line, half_width, runs_above, whittaker
-from vinemap.rows.standing.canopy import AROUND, thereabouts
+from vinemap.rows.standing.canopy import thereabouts
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Ints, Values
@@ -200,14 +200,15 @@ def _centred(ordered: Values, cover: Raster, spacing: float, curtains: float) ->
     if len(present) == 0:
         return None
     typical = float(np.median(present))
-    # Where rows are told by their ridges alone, or are of younger vines, they show more faintly.
-    even = profile * typical / thereabouts(profile, typical, around=AROUND / STATION)
+    # Where rows are told by their ridges alone, or are of younger vines, they show more faintly over many metres.
+    even = profile * typical / thereabouts(profile, typical, around=spacing / STATION)
     runs = runs_above(even, 0.5 * typical) * STATION
     runs = runs[np.diff(runs, axis=1)[:, 0] >= 0.35]
     if len(runs) == 0:
         return None
     width = typical / max(float(np.quantile(image.max(axis=1), 0.9)), 1e-6)
-    support = float(np.diff(runs, axis=1).sum()) / (runs[-1, 1] - runs[0, 0])
+    full = runs_above(profile, 0.5 * typical) * STATION
+    support = float(np.diff(full, axis=1).sum()) / (runs[-1, 1] - runs[0, 0])
     amount = float(profile[round(runs[0, 0] / STATION) : round(runs[-1, 1] / STATION) + 1].mean())
     return _Course(between(curve, runs[0, 0], runs[-1, 1]), width, support, amount)
 
