@@ -8,35 +8,26 @@ parcel's place nor its rotation matters.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
-from scipy.ndimage import maximum_filter
 
-from vinemap.cloud.frame import points_of_rows
-from vinemap.compute.compiled import compiled
-from vinemap.compute.filters import blurred
-from vinemap.compute.threads import in_threads, stretches
+from vinemap.compute.threads import in_threads
 from vinemap.geo.curve import across, between, extend, normals, resample, way_along
-from vinemap.geo.raster import Raster, nearest_cell, spread
 from vinemap.rows.centre_line import CELL, EDGE, USUAL, centre_line, half_width, half_widths, smooth_course
 from vinemap.rows.standing.canopy import Standing, cut_to_canopy, find_canopy
 from vinemap.rows.standing.gaps import lay_out
 from vinemap.rows.standing.known_ends import Known, cut_as_known
 from vinemap.rows.standing.parting import own_rows, part_rows
+from vinemap.rows.straightened import Share, deal, straighten, where_vines_are
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     import geopandas as gpd
-    from numpy.typing import NDArray
 
-    from vinemap.cloud.frame import Taken
-    from vinemap.cloud.points import PointCloud
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Flags, Ints, Values
-    from vinemap.geo.raster import Grid
+    from vinemap.compute.arrays import Flags, Values
+    from vinemap.geo.raster import Raster
     from vinemap.surfaces.cover import Levels
     from vinemap.surfaces.seen import Seen
 
@@ -46,30 +37,10 @@ FARTHER = 4
 """Times that it is looked for as far again, where it hasn't ended."""
 POINTS_A_METRE = 200.0
 """Canopy points in a metre of row for which the smoothing is meant."""
-RAMP = 0.1
-"""Metres of height over which a point becomes canopy: a hard edge would follow the terrain model's millimetres."""
-REACH = 0.2
-"""Metres beyond its half width from which a row's points are taken, as it may still move."""
 APART = 0.3
 """Share of a row's cover beside it up to which it stands apart from its neighbours."""
 LEAST_CONTRAST = 0.6
 """Contrast of a lone row's canopy to what lies beside it, below which it is a bush or a hedge."""
-
-
-class _Share(NamedTuple):
-    """A row's course (n, 2), half width and distance of two curtains in metres, and points: station, left, canopy 0–1.
-
-    Canopy is what stands above the level of its body, and that of its ridge.
-    """
-
-    curve: Values
-    half: float
-    curtains: float
-    station: Values
-    left: Values
-    body: Values
-    ridge: Values
-    known: Known | None
 
 
 def fit_rows(
@@ -118,10 +89,10 @@ def fit_rows(
     curtains = courses["curtains_m"].to_numpy()
     half = np.maximum(half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
     fits: dict[int, Standing | None] = {}
-    members, vines = np.arange(len(curves)), _where_vines_are(cover, levels, half)
+    members, vines = np.arange(len(curves)), where_vines_are(cover, levels, half)
     for _ in range(1 + FARTHER):
         known = [looked_at[k][1] for k in members]
-        for group, shares in _deal(cloud, vines, levels, curves, half[members], curtains[members], known, high):
+        for group, shares in deal(cloud, vines, levels, curves, half[members], curtains[members], known, high):
             found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
             fits |= dict(zip(members[group].tolist(), found, strict=True))
         unended = _unended(fits, half)
@@ -137,7 +108,7 @@ def fit_rows(
         for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing, cover, margin=MARGIN).items():
             k, these = list(rows)[n], [course, *beside]
             like = np.full(len(these), k)
-            dealt = _deal(cloud, vines, levels, these, half[like], curtains[like], [None] * len(these), high)
+            dealt = deal(cloud, vines, levels, these, half[like], curtains[like], [None] * len(these), high)
             share = next(share for group, shares in dealt for m, share in zip(group, shares, strict=True) if m == 0)
             rows[k] = _fit(share, theirs=theirs, smoothing=smoothing, end_share=end_share) or rows[k]
     standing = [
@@ -149,16 +120,16 @@ def fit_rows(
 
 
 def _fit(
-    share: _Share, *, smoothing: float, end_share: float, theirs: shapely.Geometry | None = None
+    share: Share, *, smoothing: float, end_share: float, theirs: shapely.Geometry | None = None
 ) -> Standing | None:
     """Centre line of a row about its course, between the ends of its canopy, which others' isn't."""
     still, known = np.zeros(len(share.curve)), share.known
     if known and len(share.station) == 0:
         return Standing(share.curve, np.empty((0, 2)), 0.0)
-    image, offsets = _straighten(share, share.body, still)
+    image, offsets = straighten(share, share.body, still)
     # Crowns lean to the side from which they were seen: where canopies stand apart whole, their flanks tell more.
     if share.ridge is not share.body and not _stands_apart(image):
-        image, offsets = _straighten(share, share.ridge, still)
+        image, offsets = straighten(share, share.ridge, still)
     cutoff = smoothing / CELL * _noise_stretch(share)
     reach = _reach(image, offsets, share.half)
     shift: Values = still
@@ -169,9 +140,9 @@ def _fit(
     if known and len(canopy := np.flatnonzero(image.sum(axis=1) * CELL > known.least)):
         shift = shift[np.clip(np.arange(len(shift)), canopy[0], canopy[-1])]
     centred = share.curve + shift[:, None] * normals(share.curve, smoothing=1 / CELL)
-    body = ridge = _straighten(share, share.body, shift)[0]
+    body = ridge = straighten(share, share.body, shift)[0]
     if share.ridge is not share.body:
-        ridge = _straighten(share, share.ridge, shift)[0]
+        ridge = straighten(share, share.ridge, shift)[0]
     if known is None:
         cells = _within(theirs, centred, offsets) if theirs else None
         return cut_to_canopy(centred, body, ridge, end_share, theirs=cells)
@@ -217,16 +188,6 @@ def _reach(image: Values, offsets: Values, half: float) -> float:
     return float(np.clip(inside, least, max(half - CELL, least)))
 
 
-def _where_vines_are(cover: Raster, levels: Levels, half: Values) -> tuple[Flags, Grid]:
-    """Cells with cover and, where that is of ridges alone, those beside, as canopies are wider below."""
-    vines: Flags = cover.values > 0
-    touching = levels.touching
-    if touching.any() and len(half):
-        wider = maximum_filter(vines, 2 * round(float(np.median(half)) / cover.grid.resolution) + 1)
-        vines |= wider & spread(touching, levels.body.grid, cover.grid)
-    return vines, cover.grid
-
-
 def _looked_at(course: dict[str, Any]) -> tuple[Values, Known | None]:
     """The curve along which a row's canopy is looked for, and what is known of the row."""
     xy = shapely.get_coordinates(course["geometry"])
@@ -239,112 +200,7 @@ def _looked_at(course: dict[str, Any]) -> tuple[Values, Known | None]:
     return curve, Known(before, way_along(curve)[-1] - after, course["slack_m"], course["moves"], course["least_m"])
 
 
-def _deal(
-    cloud: Cloud,
-    vines: tuple[Flags, Grid],
-    levels: Levels,
-    curves: Sequence[Values],
-    half: Values,
-    curtains: Values,
-    known: Sequence[Known | None],
-    high: float,
-) -> Iterator[tuple[Ints, list[_Share]]]:
-    """Curves, and of each its share of the points near it, in its own frame."""
-    touching = bool(levels.touching.any())
-
-    def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:
-        body = np.zeros(len(member), dtype=np.float32)
-        ridge = np.zeros(len(member) if touching else 0, dtype=np.float32)
-        at = vines, (levels.body.values, levels.ridge.values, levels.body.grid)
-        in_threads(
-            lambda stretch: _weigh(*stretch, part.xyz, part.heights, member, at, high, body, ridge),
-            stretches(len(member)),
-        )
-        return body, ridge if touching else body
-
-    for rows, near, (body, ridge) in points_of_rows(cloud, curves, half + REACH, canopy_of):
-        shares = []
-        for k, row in enumerate(rows):
-            mine = slice(near.start[k], near.start[k + 1])
-            scale = np.float32((len(curves[row]) - 1) / way_along(curves[row])[-1])
-            apart = ridge is body or np.array_equal(body[mine], ridge[mine])
-            columns = (body[mine],) * 2 if apart else (body[mine], ridge[mine])
-            about = float(half[row]), float(curtains[row])
-            shares.append(_Share(curves[row], *about, near.along[mine] * scale, near.left[mine], *columns, known[row]))
-        yield rows, shares
-
-
-@compiled
-def _weigh(
-    first: int,
-    last: int,
-    xyz: Values,
-    heights: Values,
-    member: NDArray[np.int32],
-    at: tuple[tuple[Flags, Grid], tuple[Values, Values, Grid]],
-    high: float,
-    body: Values,
-    ridge: Values,
-) -> None:
-    """How far members (n,) of a cloud are canopy, 0 to 1: from the levels up to a height, where there are vines."""
-    vines, (of_body, of_ridge, grid) = at
-    for k in range(first, last):
-        p = member[k]
-        i, j = nearest_cell(vines[1], xyz[p, 0], xyz[p, 1])
-        if vines[0][i, j]:
-            a, b = nearest_cell(grid, xyz[p, 0], xyz[p, 1])
-            fall = min(max((high - heights[p]) / RAMP + 0.5, 0.0), 1.0)
-            body[k] = fall * min(max((heights[p] - of_body[a, b]) / RAMP + 0.5, 0.0), 1.0)
-            if len(ridge):
-                ridge[k] = fall * min(max((heights[p] - of_ridge[a, b]) / RAMP + 0.5, 0.0), 1.0)
-
-
-def _noise_stretch(share: _Share) -> float:
+def _noise_stretch(share: Share) -> float:
     """Factor of the smoothing's wavelength: 1 at ``POINTS_A_METRE``, more where points are fewer."""
     per_metre = float(share.ridge[np.abs(share.left) <= share.half].sum()) / (len(share.curve) * CELL)
     return float(np.clip((POINTS_A_METRE / max(per_metre, 1.0)) ** 0.2, 0.8, 1.6))
-
-
-def _straighten(share: _Share, canopy: Values, shift: Values) -> tuple[Values, Values]:
-    """Cover (stations, cells across) about a curve moved to its left by ``shift`` (stations,), and cells' offsets."""
-    m = int(np.ceil(share.half / CELL))
-    return _cover(share.station, share.left, canopy, shift, m), np.arange(-m, m + 1) * CELL
-
-
-@compiled
-def _cover(station: Values, left: Values, canopy: Values, shift: Values, m: int) -> Values:
-    """Share of canopy (stations, 2 m + 1) in cells, smoothed the wider the fewer points there are."""
-    leaves, everything = _spread(station, left, canopy, shift, m)
-    density = 0.0
-    for i in range(len(shift)):
-        for j in range(2 * m + 1):
-            density += everything[i, j]
-    density = max(density / everything.size, 1e-9)
-    sigma = max(1.0, density**-0.5)
-    leaves, everything = blurred(leaves, sigma), blurred(everything, sigma)
-    for i in range(len(shift)):
-        for j in range(2 * m + 1):
-            leaves[i, j] /= everything[i, j] + 0.1 * density
-    return leaves
-
-
-@compiled
-def _spread(station: Values, left: Values, canopy: Values, shift: Values, m: int) -> tuple[Values, Values]:
-    """Canopy and points (stations, 2 m + 1) in cells; each point is shared by the four whose centres surround it."""
-    n = len(shift)
-    leaves, everything = np.zeros((n, 2 * m + 1)), np.zeros((n, 2 * m + 1))
-    for p in range(len(station)):
-        if not 0 <= station[p] < n - 1:
-            continue
-        i = int(station[p])
-        down = station[p] - i
-        across = (left[p] - shift[i] * (1 - down) - shift[i + 1] * down) / CELL + m
-        j = int(np.floor(across))
-        right = across - j
-        for b in range(2):
-            if 0 <= j + b <= 2 * m:
-                for a in range(2):
-                    part = (down if a else 1 - down) * (right if b else 1 - right)
-                    everything[i + a, j + b] += part
-                    leaves[i + a, j + b] += part * canopy[p]
-    return leaves, everything
