@@ -23,13 +23,20 @@ from vinemap.rows.standing.parting import own_rows, part_rows
 from vinemap.rows.straightened import Share, deal, straighten, where_vines_are
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     import geopandas as gpd
 
     from vinemap.cloud.tiles import Cloud
-    from vinemap.compute.arrays import Flags, Values
+    from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
     from vinemap.surfaces.cover import Levels
     from vinemap.surfaces.seen import Seen
+
+    _Dealt = Callable[..., Iterator[tuple[Ints, list[Share]]]]
+    """Deals points to curves, of half widths, distances of curtains, and what is known of them."""
+    _Fitted = Callable[..., Standing | None]
+    """Fits a row to its share."""
 
 MARGIN = 1.5
 """Metres beyond a course's ends where canopy is still looked for."""
@@ -75,7 +82,7 @@ def fit_rows(
     dtm, seen, within
         As for :func:`vinemap.rows.standing.gaps.lay_out`, which tells what is returned.
     high : float
-        Height in metres up to which they do.
+        Height in metres above which no point is canopy.
     smoothing : float
         Wavelength in metres below which bends of the centre line are taken for noise, at 200 canopy points a metre of
         row; it grows with the fifth root of their distance.
@@ -85,38 +92,64 @@ def fit_rows(
         Metres without canopy that make a gap.
     """
     looked_at = [_looked_at(course) for course in courses.to_dict("records")]
-    curves = [curve for curve, _ in looked_at]
     curtains = courses["curtains_m"].to_numpy()
-    half = np.maximum(half_widths(courses, curves, cover, levels), half_width(courses["spacing_m"]) + curtains / 2)
-    fits: dict[int, Standing | None] = {}
-    members, vines = np.arange(len(curves)), where_vines_are(cover, levels, half)
-    for _ in range(1 + FARTHER):
-        known = [looked_at[k][1] for k in members]
-        for group, shares in deal(cloud, vines, levels, curves, half[members], curtains[members], known, high):
-            found = in_threads(partial(_fit, smoothing=smoothing, end_share=end_share), shares)
-            fits |= dict(zip(members[group].tolist(), found, strict=True))
-        unended = _unended(fits, half)
-        if not unended:
-            break
-        members = np.array(list(unended))
-        curves = [smooth_course(curve, beyond=MARGIN) for curve in unended.values()]
+    half = np.maximum(
+        half_widths(courses, [curve for curve, _ in looked_at], cover, levels),
+        half_width(courses["spacing_m"]) + curtains / 2,
+    )
+    dealt = partial(deal, cloud, where_vines_are(cover, levels, half), levels, high=high)
+    fitted = partial(_fit, smoothing=smoothing, end_share=end_share)
+    rows = _followed(looked_at, half, curtains, dealt, fitted)
     if settled := [of for _, of in looked_at if of]:
-        rows = dict(enumerate(cut_as_known([row for _, row in sorted(fits.items()) if row], settled)))
+        rows = dict(enumerate(cut_as_known(list(rows.values()), settled)))
     else:
-        rows = own_rows({k: fit for k, fit in sorted(fits.items()) if fit})
-        spacing = courses["spacing_m"].to_numpy()[list(rows)]
-        for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing, cover, margin=MARGIN).items():
-            k, these = list(rows)[n], [course, *beside]
-            like = np.full(len(these), k)
-            dealt = deal(cloud, vines, levels, these, half[like], curtains[like], [None] * len(these), high)
-            share = next(share for group, shares in dealt for m, share in zip(group, shares, strict=True) if m == 0)
-            rows[k] = _fit(share, theirs=theirs, smoothing=smoothing, end_share=end_share) or rows[k]
+        rows = own_rows(rows)
+        rows |= _parted(rows, courses["spacing_m"].to_numpy(), half, curtains, cover, dealt, fitted)
     standing = [
         (spacing, fit)
         for k, (spacing, alone) in enumerate(zip(courses["spacing_m"], courses["alone"], strict=True))
         if (fit := rows.get(k)) and not (alone and fit.contrast < LEAST_CONTRAST)
     ]
     return lay_out(standing, seen, dtm, within=within, min_gap=min_gap)
+
+
+def _followed(
+    looked_at: list[tuple[Values, Known | None]], half: Values, curtains: Values, dealt: _Dealt, fitted: _Fitted
+) -> dict[int, Standing]:
+    """The rows that stand, by the places of their courses, each followed as far as its canopy goes on."""
+    fits: dict[int, Standing | None] = {}
+    members, curves = np.arange(len(looked_at)), [curve for curve, _ in looked_at]
+    for _ in range(1 + FARTHER):
+        known = [looked_at[k][1] for k in members]
+        for group, shares in dealt(curves, half[members], curtains[members], known):
+            fits |= dict(zip(members[group].tolist(), in_threads(fitted, shares), strict=True))
+        unended = _unended(fits, half)
+        if not unended:
+            break
+        members = np.array(list(unended))
+        curves = [smooth_course(curve, beyond=MARGIN) for curve in unended.values()]
+    return {k: fit for k, fit in sorted(fits.items()) if fit}
+
+
+def _parted(
+    rows: dict[int, Standing],
+    spacing: Values,
+    half: Values,
+    curtains: Values,
+    cover: Raster,
+    dealt: _Dealt,
+    fitted: _Fitted,
+) -> dict[int, Standing]:
+    """Those of the rows that end in the canopies of others, without what isn't theirs."""
+    out, places = {}, list(rows)
+    for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing[places], cover, margin=MARGIN).items():
+        k, curves = places[n], [course, *beside]
+        like = np.full(len(curves), k)
+        for group, shares in dealt(curves, half[like], curtains[like], [None] * len(curves)):
+            own = [share for m, share in zip(group, shares, strict=True) if m == 0]
+            if own and (row := fitted(own[0], theirs=theirs)):
+                out[k] = row
+    return out
 
 
 def _fit(

@@ -68,6 +68,7 @@ def deal(
     half: Values,
     curtains: Values,
     known: Sequence[Known | None],
+    *,
     high: float,
 ) -> Iterator[tuple[Ints, list[Share]]]:
     """Curves, and of each its share of the points near it, in its own frame."""
