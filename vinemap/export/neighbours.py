@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 
 from vinemap.geo.curve import at, tangents, way_along
+from vinemap.rows.blocks import NEIGHBOURS
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
 
 STEP = 0.5
 """Metres between the places of a row from which it looks around."""
-NEIGHBOURS = 1.6
-"""Spacings within which rows are neighbours; where a whole row is missing, nothing tells what stands there."""
 SIGHT = 3.0
 """Spacings as far as which is looked for the row on the other side."""
 

@@ -14,7 +14,7 @@ SAME_DIRECTION = np.radians(20)
 SAME_SPACING = 1.2
 """Ratio of their spacings."""
 NEIGHBOURS = 1.6
-"""Spacings within which rows are neighbours."""
+"""Spacings within which rows are neighbours; where a whole row is missing, nothing tells what stands there."""
 SLACK = 0.02
 """Metres to which distances of rows are needed."""
 ODD_SPACING = 1.5

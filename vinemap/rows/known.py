@@ -19,6 +19,7 @@ from vinemap.geo.curve import normals, resample
 from vinemap.geo.layers import some_of
 from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import whittaker
+from vinemap.rows.curtains import DIP, PAIR, UNEVEN
 from vinemap.surfaces.lines import PARALLEL, STEP
 
 if TYPE_CHECKING:
@@ -38,9 +39,6 @@ HELD = 0.1
 ALLEY, APART = 0.1, 0.5
 """Half width, in spacings, of what lies midway between rows, and the most cover there, in that of a row that stands
 apart."""
-PAIR, UNEVEN, DIP = 0.65, 0.15, 0.7
-"""Distance of a row's curtains in that to the next row's, share of it by which they may lie unevenly, and cover between
-them in theirs, at the most."""
 ONE_ROW = 0.3
 """Spacings within which two lines that have moved lie on one row, if it is along half of the shorter one."""
 THIN, LEAST = 0.02, 0.15
