@@ -10,7 +10,7 @@ from vinemap import paths
 from vinemap.config.surveys import load_survey
 from vinemap.errors import InputError
 from vinemap.jobs import configured
-from vinemap.jobs.configured import chosen, map_one, products_of
+from vinemap.jobs.configured import chosen, map_one, products_folder
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def mapped(monkeypatch, name, parcel):
 
 
 def test_products_lie_in_the_estates_folder_whoever_maps(here, monkeypatch):
-    assert chosen("may")[1] == products_of("may") == paths.survey_products("may")
+    assert chosen("may")[1] == products_folder("may") == paths.survey_products("may")
     assert mapped(monkeypatch, "may", "B")[1:] == (paths.survey_products("may") / "B", paths.survey_products("may"))
     paths.ESTATE.write_text(json.dumps({"surveys": "in", "products": "disk/products"}))
     big = here.folder.parent / "disk" / "products" / "may"

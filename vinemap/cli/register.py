@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 def register(products: tuple[Path, ...], path: Path | None, how: str | None) -> None:
     """Put the rows of each PRODUCT (its folder or GeoPackage, or that of a survey) into the estate's register."""
     from vinemap import paths
-    from vinemap.export.field import products_of
     from vinemap.jobs.register import register_products
+    from vinemap.product.seasons.products import products_of
 
     found = [one for given in products for one in products_of(given)]
     for line in register_products(found, path or paths.REGISTER, how=how):

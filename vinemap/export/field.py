@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import geopandas as gpd
@@ -17,7 +16,7 @@ from vinemap.errors import InputError
 from vinemap.export.lanes import lanes_between
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.geo.main import Corner, Origin, origin_of, to_main
-from vinemap.product.seasons.products import places_of
+from vinemap.product.seasons.products import read_record
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -93,46 +92,6 @@ class Field(NamedTuple):
         for block in numbers:
             rows, lanes = (layer[layer["block"] == block] for layer in (self.rows, self.lanes))
             yield int(block) if len(numbers) > 1 else None, self._replace(rows=rows, lanes=lanes)
-
-
-def products_of(given: Path) -> list[Path]:
-    """The products that a path means: of a survey's folder those of its parcels, of any other the path itself.
-
-    Raises
-    ------
-    InputError
-        If there is none in the survey's folder.
-    """
-    if paths.run_record(given).is_file() or not paths.survey_record(given).is_file():
-        return [given]
-    products = places_of(given)
-    if not products:
-        raise InputError(f"{naming.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
-    return products
-
-
-def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
-    """Folder of a product, given by its folder or its GeoPackage, and the record of its run.
-
-    Raises
-    ------
-    InputError
-        If it is no whole product.
-    """
-    folder = product if product.is_dir() else product.parent
-    try:
-        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        record["parcel"] = str(record["parcel"])
-        origin_of(record["origin"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{naming.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, "
-            "or its GeoPackage"
-        ) from error
-    path = paths.geopackage(folder, record["parcel"])
-    if product not in (folder, path):
-        raise InputError(f"{naming.shown(product)}: no product of vinemap: {naming.shown(path)} is one")
-    return folder, record
 
 
 def read_layers(

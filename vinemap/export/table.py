@@ -16,10 +16,10 @@ from vinemap import naming, paths
 from vinemap.compute.threads import in_threads
 from vinemap.errors import InputError
 from vinemap.evaluate.changes import follow_rows
-from vinemap.export.field import read_layers, read_record
+from vinemap.export.field import read_layers
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.product.layers import REAL, TEXT, WHOLE
-from vinemap.product.seasons.products import Product, read_product, same_places, shift_between
+from vinemap.product.seasons.products import Product, read_product, read_record, same_places, shift_between
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,7 +12,7 @@ from vinemap import __version__, naming, paths
 from vinemap.errors import InputError, reason_of
 from vinemap.export import MESHES, TABLE
 from vinemap.export.agopengps import write_agopengps
-from vinemap.export.field import products_of, read_field
+from vinemap.export.field import read_field
 from vinemap.export.gazebo import write_gazebo
 from vinemap.export.isoxml import write_isoxml
 from vinemap.export.meshes import write_canopy
@@ -21,6 +21,7 @@ from vinemap.export.opennav_coverage import write_opennav_coverage
 from vinemap.export.table import read_tables, write_tables
 from vinemap.export.vector import write_geojson, write_shapefile
 from vinemap.product import store
+from vinemap.product.seasons.products import products_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -30,7 +30,7 @@ def chosen(survey: str) -> tuple[SurveyConfig, Path]:
     path = Path(survey) if survey.endswith((".yaml", ".yml")) else paths.configuration(survey)
     if path.is_file() or not paths.ESTATE.is_file():
         config = load_survey(path)
-        return config, products_of(config.survey)
+        return config, products_folder(config.survey)
     estate = load_estate(paths.ESTATE)
     found = {arrival.name: arrival for arrival in arrivals(estate)}
     if survey not in found:
@@ -38,10 +38,10 @@ def chosen(survey: str) -> tuple[SurveyConfig, Path]:
     arrival = found[survey]
     if not arrival.config:
         raise ConfigError(f"{survey}: {arrival.reason}")
-    return arrival.config, products_of(survey)
+    return arrival.config, products_folder(survey)
 
 
-def products_of(survey: str) -> Path:
+def products_folder(survey: str) -> Path:
     """Folder of a survey's products: in the estate's, where there is one, so that every night finds them.
 
     Raises
@@ -60,7 +60,7 @@ def map_one(config: SurveyConfig, parcel: str, *, step: Callable[..., Any]) -> S
     VinemapError
         As that function.
     """
-    products = products_of(config.survey)
+    products = products_folder(config.survey)
     alone = config.boundaries is None and not paths.survey_boundaries(config.survey).exists()
     check_engines(config.all_settings())
     chosen = config if alone else config.model_copy(update={"parcels": [parcel]})

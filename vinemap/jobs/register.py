@@ -15,7 +15,6 @@ from vinemap import naming, paths
 from vinemap.errors import BusyError, InputError, OutputError
 from vinemap.evaluate.changes import are_others, estimate_shift, lie_aside
 from vinemap.evaluate.rows import match_rows
-from vinemap.export.field import read_record
 from vinemap.geo.crs import is_local, parse_crs, project
 from vinemap.geo.layers import some_of
 from vinemap.geo.lines import KnownRows, rows_of
@@ -27,7 +26,7 @@ from vinemap.product.register.file import (
     stamps_of,
     update_register,
 )
-from vinemap.product.seasons.products import read_rows
+from vinemap.product.seasons.products import read_record, read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

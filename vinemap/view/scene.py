@@ -13,8 +13,8 @@ from pyogrio.errors import DataLayerError, DataSourceError
 from vinemap import naming, paths
 from vinemap.cloud.las import read_cloud
 from vinemap.errors import InputError
-from vinemap.export.field import products_of, read_record
 from vinemap.product.gltf import read_glb
+from vinemap.product.seasons.products import products_of, read_record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

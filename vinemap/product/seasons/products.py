@@ -11,8 +11,10 @@ import pyogrio
 import shapely
 from pyogrio.errors import DataLayerError, DataSourceError
 
-from vinemap import paths
+from vinemap import naming, paths
+from vinemap.errors import InputError
 from vinemap.evaluate.changes import MEASURES
+from vinemap.geo.main import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -71,6 +73,46 @@ def places_of(folder: Path) -> list[Path]:
         return sorted(path.parent for path in folder.glob(f"*/{paths.RUN}") if path.parent not in gone)
     except OSError:
         return []
+
+
+def products_of(given: Path) -> list[Path]:
+    """The products that a path means: of a survey's folder those of its parcels, of any other the path itself.
+
+    Raises
+    ------
+    InputError
+        If there is none in the survey's folder.
+    """
+    if paths.run_record(given).is_file() or not paths.survey_record(given).is_file():
+        return [given]
+    products = places_of(given)
+    if not products:
+        raise InputError(f"{naming.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
+    return products
+
+
+def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
+    """Folder of a product, given by its folder or its GeoPackage, and the record of its run.
+
+    Raises
+    ------
+    InputError
+        If it is no whole product.
+    """
+    folder = product if product.is_dir() else product.parent
+    try:
+        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
+        record["parcel"] = str(record["parcel"])
+        origin_of(record["origin"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{naming.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, "
+            "or its GeoPackage"
+        ) from error
+    path = paths.geopackage(folder, record["parcel"])
+    if product not in (folder, path):
+        raise InputError(f"{naming.shown(product)}: no product of vinemap: {naming.shown(path)} is one")
+    return folder, record
 
 
 def whose(place: Path) -> tuple[str, str] | None:
