@@ -25,6 +25,10 @@ class GridError(InputError):
     heals = True
 
 
+class EmptyError(InputError):
+    """A file has no points that count."""
+
+
 class OutsideError(InputError):
     """A cloud has no point in a parcel."""
 
@@ -49,6 +53,11 @@ class BusyError(VinemapError):
 
 class WorkerError(VinemapError):
     """A process died of its work, or would have taken more than it may."""
+
+
+def left_out(name: str) -> str:
+    """What is said of a file without points, where others have some."""
+    return f"{name} holds no usable points, and is left out"
 
 
 def own_fault(error: BaseException, where: str = "") -> str:

@@ -280,6 +280,16 @@ def test_all_noise(tmp_path, points):
         read_cloud(write_las(tmp_path / "a.las", points, classification=np.full(len(points), 7, dtype=np.uint8)))
 
 
+def test_tiles_without_points_are_left_out_and_named(tmp_path, points):
+    noise = {"classification": np.full(len(points), 7, dtype=np.uint8)}
+    empty, noisy = write_las(tmp_path / "a.las", np.empty((0, 3))), write_las(tmp_path / "b.las", points, **noise)
+    cloud = read_cloud([empty, write_las(tmp_path / "c.las", points), noisy])
+    assert cloud.size == len(points)
+    assert cloud.remarks == tuple(f"{name} holds no usable points, and is left out" for name in ("a.las", "b.las"))
+    with pytest.raises(InputError, match="no usable points"):
+        read_cloud([empty, noisy])
+
+
 def test_coordinates_that_are_no_numbers(tmp_path, points):
     path = write_las(tmp_path / "a.las", points)
     data = bytearray(path.read_bytes())

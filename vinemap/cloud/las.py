@@ -20,7 +20,7 @@ from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
 from vinemap.compute.threads import ahead
-from vinemap.errors import PASSING, BusyError, InputError, OutsideError
+from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideError, left_out
 from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name
 from vinemap.geo.place import Place
@@ -154,23 +154,40 @@ class _Chunk(NamedTuple):
 def _chunks_of(
     files: Sequence[Path], crs: CRS | None, around: Boundary | None, remarks: list[str], engine: str
 ) -> Generator[_Chunk]:
-    """Usable points of files, one after the other, once their first ones were found to be where they can be."""
+    """Usable points of files, one after the other, once their first ones were found to be where they can be.
+
+    Of several those without any are left out, as tiles may be.
+    """
+    empty = 0
     for path in files:
-        if kind_of(path) or engine == "pdal":
-            for xyz, source in other_chunks(path, crs, around, remarks, engine=engine):
+        try:
+            yield from _chunks_in(path, crs, around, remarks, engine)
+        except EmptyError:
+            empty += 1
+            if empty == len(files):
+                raise
+            remarks.append(left_out(path.name))
+
+
+def _chunks_in(
+    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str], engine: str
+) -> Generator[_Chunk]:
+    """Usable points of a file."""
+    if kind_of(path) or engine == "pdal":
+        for xyz, source in other_chunks(path, crs, around, remarks, engine=engine):
+            yield _Chunk(xyz, source, path)
+        return
+    with opened(path, crs=crs) as (reader, source, layout):
+        box = _small_box(reader.header, source, around) if around else None
+        found = points_about(path, layout, box, needed()) if box else None
+        chunks = _usable_chunks(reader, path, found)
+        first = next(chunks, None)
+        if first is None and found is None:
+            raise EmptyError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+        if first is not None:
+            remarks += examined(first, reader.header, source, path, given=crs is not None)
+            for xyz in chain([first], chunks):
                 yield _Chunk(xyz, source, path)
-            continue
-        with opened(path, crs=crs) as (reader, source, layout):
-            box = _small_box(reader.header, source, around) if around else None
-            found = points_about(path, layout, box, needed()) if box else None
-            chunks = _usable_chunks(reader, path, found)
-            first = next(chunks, None)
-            if first is None and found is None:
-                raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
-            if first is not None:
-                remarks += examined(first, reader.header, source, path, given=crs is not None)
-                for xyz in chain([first], chunks):
-                    yield _Chunk(xyz, source, path)
 
 
 @contextmanager
@@ -209,7 +226,7 @@ def _backends(layout: Layout) -> Any:
 
 def _check_header(header: Any, crs: CRS, path: Path) -> None:
     if header.point_count == 0:
-        raise InputError(f"{path}: holds no points")
+        raise EmptyError(f"{path}: holds no points")
     numbers = np.concatenate([header.scales, header.offsets])
     if not (np.abs(numbers) < FARTHEST).all() or (np.abs(header.scales) < FINEST).any():
         raise InputError(f"{path}: scale or offset in its header is no number that a place has: write the file again")

@@ -18,7 +18,7 @@ from vinemap.cloud.formats.surface import read_surface
 from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.formats.told import Header, reading
 from vinemap.cloud.pdal.reader import read_pdal
-from vinemap.errors import InputError
+from vinemap.errors import EmptyError, InputError
 from vinemap.geo.place import check_place, doubts_of
 from vinemap.geo.stated import crs_of, examined
 
@@ -56,7 +56,7 @@ def other_chunks(
     with closing(points.chunks) as chunks, reading(path, WORDS.get(kind, kind.upper())):
         first = next((chunk for chunk in chunks if len(chunk)), None)
         if first is None and around is None:
-            raise InputError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+            raise EmptyError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
         if first is None:
             return
         header = _with_box(points, first)
