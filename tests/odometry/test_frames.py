@@ -1,5 +1,7 @@
 """Recordings: folders of images and videos, their order, their times, and what is wrong with some of them."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,12 @@ from vinemap.simulate.camera import LOW, Weather, render
 
 N = 6
 NUMBERS = (1, 2, 9, 10, 11, 100)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quiet():
+    """FFmpeg asks once a process how much it may say: here when a video is written, before any is read."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @pytest.fixture(scope="module")
