@@ -48,13 +48,21 @@ def messages():
     return found
 
 
+def _name(function):
+    return getattr(function, "id", None)
+
+
+def _adds_a_remark(function):
+    return isinstance(function, ast.Attribute) and function.attr == "append" and _name(function.value) == "remarks"
+
+
 def said(source, *, sentences=False):
     """Messages of the errors that a module makes, and all sentences in it where these are messages, too."""
     tree = ast.parse(source)
     other = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     other |= {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", None) in REFUSALS and node.args:
+        if isinstance(node, ast.Call) and node.args and (_name(node.func) in REFUSALS or _adds_a_remark(node.func)):
             text = plain(node.args[0])
         elif sentences and id(node) not in other and len(re.findall(r"(?<!\S)[\w'(]+", plain(node))) >= WORDS:
             text = plain(node)

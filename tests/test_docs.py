@@ -89,6 +89,7 @@ def test_every_message_is_explained():
     [
         ('raise InputError(f"{path}: holds {n} things")', ["…: holds … things"]),
         ('raise OutsideError("nothing " "there")', ["nothing there"]),
+        ('remarks.append(f"{name} is left out")\nnames.append("no remark")', ["… is left out"]),
         ('raise Flaw("ends too early")\nx = "as high as {height_m:.0f} m"', ["ends too early", "as high as … m"]),
         ('raise InputError(reason)\nx = "five words are a remark"', ["five words are a remark"]),
         ('"""A docstring of five words."""\nx = "no remark"\ny = f"{a}: {b}"', []),

@@ -55,11 +55,6 @@ class WorkerError(VinemapError):
     """A process died of its work, or would have taken more than it may."""
 
 
-def left_out(name: str) -> str:
-    """What is said of a file without points, where others have some."""
-    return f"{name} holds no usable points, and is left out"
-
-
 def own_fault(error: BaseException, where: str = "") -> str:
     """What is said of an error that vinemap didn't raise on purpose."""
     return f"a fault of vinemap's own ({type(error).__name__}: {error}{where})"

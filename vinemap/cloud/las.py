@@ -20,7 +20,7 @@ from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
 from vinemap.compute.threads import ahead
-from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideError, left_out
+from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideError
 from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name
 from vinemap.geo.place import Place
@@ -166,7 +166,7 @@ def _chunks_of(
             empty += 1
             if empty == len(files):
                 raise
-            remarks.append(left_out(path.name))
+            remarks.append(f"{path.name} holds no usable points, and is left out")
 
 
 def _chunks_in(
