@@ -292,3 +292,13 @@ def test_alleys_without_ground(reach, told):
     near = shapely.dwithin(shapely.points(np.stack(np.meshgrid(*grid.centres()), axis=-1)), lines, reach)
     remarks = ground_notices(standing.assign(spacing_m=2.0), Raster(np.where(near, 0.5, np.nan), grid, standing.crs))
     assert [remark.startswith("alleys show ground on 0% of their length only") for remark in remarks] == [True] * told
+
+
+def test_alleys_of_a_sparse_cloud_show_ground():
+    """Of 3 points a square metre few fall into cells of an alley's middle."""
+    standing = side_by_side(2, 2, 2)
+    grid = Grid(WEST - 5, NORTH + 20, 0.1, 300, 400)
+    shown = np.random.default_rng(0).random(grid.shape) < 0.03
+    assert (
+        ground_notices(standing.assign(spacing_m=2.0), Raster(np.where(shown, 0.5, np.nan), grid, standing.crs)) == []
+    )

@@ -96,7 +96,7 @@ def test_leaves_noise_withheld_points_and_strays_out(pdal, tmp_path, points):
 
 
 def test_of_a_copc_only_what_is_near_is_read(stand_in, pdal, tmp_path, points):
-    pytest.importorskip("copclib")
+    pytest.importorskip("copclib", reason="needs copclib, which writes COPC files")
     path = write_copc(tmp_path / "a.copc.laz", points)
     cloud = assert_same(path, boundary=(SQUARE, UTM))
     assert len(cloud.xyz) > 500
@@ -112,7 +112,7 @@ def test_of_a_copc_only_what_is_near_is_read(stand_in, pdal, tmp_path, points):
 @pytest.mark.parametrize("name", ["a.copc.laz", "a.laz"])
 def test_a_boundary_elsewhere(pdal, tmp_path, points, name):
     """Where PDAL gives no array at all."""
-    pytest.importorskip("copclib")
+    pytest.importorskip("copclib", reason="needs copclib, which writes COPC files")
     path = write_copc(tmp_path / name, points) if "copc" in name else write_las(tmp_path / name, points)
     with pytest.raises(OutsideError, match="no point lies inside the boundary"):
         by_pdal(path, boundary=(ELSEWHERE, UTM))
