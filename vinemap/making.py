@@ -82,8 +82,18 @@ def make_product(
         rows, table = as_seen(rows, model.table, tops=recipe.tops)
         rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
         standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
-        given = {"vine_spacing": settings.missing.vine_spacing, "known": standing, "step": apart}
-        rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **given)
+        vine_spacing = settings.missing.vine_spacing
+        rows, gaps, vines = run(
+            "Vines",
+            find_vines,
+            rows,
+            found.gaps,
+            table,
+            found.cover,
+            vine_spacing=vine_spacing,
+            step=apart,
+            known=standing,
+        )
         rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
         del model  # much memory, that what follows doesn't need
         outlines = parcel_layer(parcel, rows, polygon, points)

@@ -48,12 +48,10 @@ def abreast(profile: Values, offsets: Values, nodes: Values, cover: Raster, *, m
     They are x, y, the distance of two curtains of a row, 0 where all are about as far from each other, that of two rows
     if they have two, and metres of gaps: those of both curtains of a row, of one alone, and of it and the next row's.
     """
-    middle = profile[:, 1:-1]
-    peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
-    node, k = np.nonzero(peak)
+    node, k = np.nonzero(peaks(profile, min_cover))
     if len(node) < 4:
         return np.empty((0, 7))
-    top, v = middle[node, k], offsets[k + 1]
+    top, v = profile[node, k + 1], offsets[k + 1]
     between = np.minimum.reduceat(profile.ravel(), node * profile.shape[1] + k + 1)[:-1]
     apart = (np.diff(node) == 0) & (between <= DIP * np.minimum(top[:-1], top[1:]))
     gap = np.diff(v)
@@ -69,6 +67,13 @@ def abreast(profile: Values, offsets: Values, nodes: Values, cover: Raster, *, m
     out[of, 4:] = _gaps(nodes[node[of]], v[of[:, None] + np.arange(4)], (outer < second)[of], cover)
     found: Values = out[shown]
     return found
+
+
+def peaks(profile: Values, least: float) -> Flags:
+    """Where profiles (n, bins) have maxima of so much at the least: (n, bins - 2), as none is at an end."""
+    middle = profile[:, 1:-1]
+    out: Flags = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= least)
+    return out
 
 
 def _gaps(nodes: Values, v: Values, ends: Flags, cover: Raster) -> Values:

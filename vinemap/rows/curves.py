@@ -201,8 +201,8 @@ def _centred(ordered: Values, cover: Raster, spacing: float, curtains: float) ->
         return None
     typical = float(np.median(present))
     # Where rows are told by their ridges alone, or are of younger vines, they show more faintly over many metres.
-    even = profile * typical / thereabouts(profile, typical, around=spacing / STATION)
-    runs = runs_above(even, 0.5 * typical) * STATION
+    relative = profile / thereabouts(profile, typical, around=spacing / STATION)
+    runs = runs_above(relative, 0.5) * STATION
     runs = runs[np.diff(runs, axis=1)[:, 0] >= 0.35]
     if len(runs) == 0:
         return None

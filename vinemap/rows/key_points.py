@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from vinemap.compute.threads import in_threads
 from vinemap.geo.raster import sample, sample_across
-from vinemap.rows.curtains import FAR, SOME, abreast, with_curtains
+from vinemap.rows.curtains import FAR, SOME, abreast, peaks, with_curtains
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
@@ -165,10 +165,7 @@ def _smoothed(profile: Values, offsets: Values, spacing: Values, smoothing: floa
 
 def _maxima(profile: Values, offsets: Values, nodes: Values, reach: float, min_cover: float) -> Values:
     """Maxima (m, 7) of the profiles: x, y, cover, direction (degrees), and what else is known of their nodes (n, 6)."""
-    middle = profile[:, 1:-1]
-    peak = (middle >= profile[:, :-2]) & (middle > profile[:, 2:]) & (middle >= min_cover)
-    peak &= np.abs(offsets[1:-1]) <= reach * nodes[:, 3:4]
-    node, k = np.nonzero(peak)
+    node, k = np.nonzero(peaks(profile, min_cover) & (np.abs(offsets[1:-1]) <= reach * nodes[:, 3:4]))
     left, top, right = profile[node, k], profile[node, k + 1], profile[node, k + 2]
     shift = 0.5 * (left - right) / np.minimum(left - 2 * top + right, -1e-9)
     v = offsets[k + 1] + (offsets[1] - offsets[0]) * np.clip(shift, -0.5, 0.5)

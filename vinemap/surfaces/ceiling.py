@@ -164,11 +164,11 @@ def _cover_crops(chm: Raster, high: float, density: float) -> Flags:
         out: Flags = away[at] <= 0.5 * half
         return out
 
-    strip, beside = strips[i, j], row_width[rows[a, b]]
+    strip = strips[i, j]
     n = np.maximum(np.bincount(strip, minlength=len(width)), 1)
-    among = a_row_stands(-2 * half) & np.any([a_row_stands(wide + n * half) for n in NEXT], axis=0)
+    among = a_row_stands(-2 * half) & np.any([a_row_stands(wide + times * half) for times in NEXT], axis=0)
     between = np.bincount(strip, among, minlength=len(width)) / n
-    broader = width >= BROADER * np.bincount(strip, beside, minlength=len(width)) / n
+    broader = width >= BROADER * np.bincount(strip, wide, minlength=len(width)) / n
     crops = (long & broader & (between >= BOTH_SIDES))[strips] & low
     if np.count_nonzero(crops) >= most:
         out = low & broader[strips]
