@@ -9,8 +9,8 @@ import shapely
 from shapely.geometry import LineString, MultiLineString, Point, Polygon
 
 from vinemap.errors import InputError
+from vinemap.evaluate.reference import read_lines
 from vinemap.evaluate.rows import as_layer, evaluate_rows, format_table, match_rows
-from vinemap.geo.lines import read_lines
 
 UTM = "EPSG:32632"
 X, Y = 414_700.0, 4_940_700.0

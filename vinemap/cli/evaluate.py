@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 @click.option("--pairs", type=FILE, help="GeoPackage to write: matched, extra and missed rows with their indices.")
 def evaluate(result: Path, reference: Path, layer: str | None, parcel: str | None, pairs: Path | None) -> None:
     """Compare the rows of RESULT with lines drawn in REFERENCE: the six indices of Table 2.2."""
+    from vinemap.evaluate.reference import read_lines
     from vinemap.evaluate.rows import as_layer, evaluate_rows, format_table
-    from vinemap.geo.lines import read_lines
     from vinemap.product.geopackage import write_layer
 
     found, drawn = read_lines(result), read_lines(reference, layer, parcel=parcel)

@@ -11,8 +11,8 @@ import shapely
 
 from vinemap import paths
 from vinemap.errors import InputError, OutputError
+from vinemap.evaluate.reference import read_lines
 from vinemap.geo.crs import WGS84, metric_crs
-from vinemap.geo.lines import read_lines
 from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import read_recording
 from vinemap.odometry.layers import NOWHERE, TRACK_LAYERS, beside_rows, track_layers

@@ -107,8 +107,8 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     import geopandas as gpd
     from sklearn.cluster import DBSCAN
 
+    from vinemap.evaluate.reference import read_lines
     from vinemap.evaluate.rows import evaluate_rows
-    from vinemap.geo.lines import read_lines
     from vinemap.geo.raster import sample
 
     xyz, found = mapped(cloud, boundary)

@@ -55,8 +55,8 @@ def peaks(cloud: str, boundary: str, out: str) -> dict[str, int | None]:
 
 def judged(rows: str, truth: str, volume: float) -> dict[str, Any]:
     """What of rows, with their volumes, is right (:class:`vinemap.measure.bench.bars.Found`)."""
+    from vinemap.evaluate.reference import read_lines
     from vinemap.evaluate.rows import evaluate_rows
-    from vinemap.geo.lines import read_lines
 
     found, drawn = read_lines(rows, "rows"), read_lines(truth, "rows")
     evaluation = evaluate_rows(found[["geometry"]], drawn[["geometry"]])
