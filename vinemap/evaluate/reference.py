@@ -12,7 +12,7 @@ from pyogrio.errors import DataLayerError, DataSourceError
 from shapely.errors import ShapelyError
 
 from vinemap.errors import InputError
-from vinemap.geo.layers import Layer, words_of
+from vinemap.geo.layers import read_layer, words_of
 from vinemap.geo.lines import ROW_LAYER
 
 
@@ -41,7 +41,7 @@ def read_lines(path: str | Path, layer: str | None = None, *, parcel: str | None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on a file's odd header
             layer = _line_layer(path, layer)
-            lines = Layer(str(path), layer, "").read()
+            lines = read_layer(str(path), layer)
     except (DataSourceError, DataLayerError, ShapelyError, OSError) as error:
         reason = str(error).split("; ", maxsplit=1)[0].replace("\n", " ")
         raise InputError(f"{path}: can't be read ({reason}); write it again as a GeoPackage, in QGIS say") from error

@@ -45,12 +45,17 @@ class Layer(NamedTuple):
 
     def read(self) -> gpd.GeoDataFrame:
         """What it holds."""
-        import geopandas as gpd  # a quarter of a second of start-up, needed for people's files only
+        return read_layer(self.source, self.name)
 
-        for encoding in ENCODINGS if self.source.lower().endswith(".shp") else ():
-            with suppress(UnicodeDecodeError):
-                return gpd.read_file(self.source, layer=self.name, encoding=encoding)
-        return gpd.read_file(self.source, layer=self.name)
+
+def read_layer(source: str, name: str) -> gpd.GeoDataFrame:
+    """What a layer of a file holds, of a Shapefile in the first encoding in which its words can be read."""
+    import geopandas as gpd  # a quarter of a second of start-up, needed for people's files only
+
+    for encoding in ENCODINGS if source.lower().endswith(".shp") else ():
+        with suppress(UnicodeDecodeError):
+            return gpd.read_file(source, layer=name, encoding=encoding)
+    return gpd.read_file(source, layer=name)
 
 
 def read_layers(
