@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
     Box = tuple[range, range, range]
     Index = tuple[int, int, int]
+    Window = tuple[int, range, range]
 
 COARSE_STEP, CANDIDATES = 3.0, 8
 """The coarse search: degrees between its angles, and peaks that are looked into."""
 
-CLIMBS = 8
+CLIMBS = 4
 """Times that a peak may lie on the edge of where it is looked for before it is left."""
 
 
@@ -52,6 +53,8 @@ class Search(NamedTuple):
     """All angles, in steps, and all rows and columns."""
     turned: dict[int, Values]
     """The template turned by so many steps, where it was before."""
+    planes: dict[Window, Values]
+    """Correlations at so many steps in rows and columns, where they were asked for before."""
 
 
 def search_of(
@@ -60,7 +63,8 @@ def search_of(
     """Look for a template at all places of the second image and at angles between two, in degrees."""
     height, width = b.shape
     turns = range(int(np.floor(angles[0] / step)) - 1, int(np.ceil(angles[1] / step)) + 2)
-    return Search(a, b, centre, half, step, cubic, (turns, range(half, height - half), range(half, width - half)), {})
+    whole = turns, range(half, height - half), range(half, width - half)
+    return Search(a, b, centre, half, step, cubic, whole, {}, {})
 
 
 def place_at(search: Search, index: Sequence[float] | Values) -> Place:
@@ -77,15 +81,20 @@ def warp(angle: float, source: Sequence[float] | Values, target: Sequence[float]
 
 def correlation(search: Search, box: Box) -> Values:
     """γ(u, v, ϑ) of Eq. 5 at the angles, rows and columns of a box, (n, rows, columns)."""
+    turns, rows, columns = box
+    return np.stack([_plane(search, (turn, rows, columns)) for turn in turns])
+
+
+def _plane(search: Search, window: Window) -> Values:
+    """The correlation at one angle."""
     import cv2
 
-    turns, rows, columns = box
-    half = search.half
-    part = search.b[rows[0] - half : rows[-1] + half + 1, columns[0] - half : columns[-1] + half + 1]
-    out = np.empty((len(turns), len(rows), len(columns)), np.float32)
-    for turn, plane in zip(turns, out, strict=True):
-        plane[:] = cv2.matchTemplate(part, _template(search, turn), cv2.TM_CCOEFF_NORMED)
-    return out
+    if window not in search.planes:
+        turn, rows, columns = window
+        half = search.half
+        part = search.b[rows[0] - half : rows[-1] + half + 1, columns[0] - half : columns[-1] + half + 1]
+        search.planes[window] = np.asarray(cv2.matchTemplate(part, _template(search, turn), cv2.TM_CCOEFF_NORMED))
+    return search.planes[window]
 
 
 def _template(search: Search, turn: int) -> Values:
@@ -141,8 +150,13 @@ def climb(search: Search, start: Place, reach: int) -> tuple[Index, float]:
     higher, score = peak(search, box)
     for _ in range(CLIMBS):
         beside = near(search, higher, (1, 1, 1))
-        if all(part[0] in seen and part[-1] in seen for part, seen in zip(beside, box, strict=True)):
+        if _holds(box, beside):
             break
-        box = beside
+        about = near(search, higher, (1, reach, reach))
+        box = about if not _holds(box[1:], beside[1:]) else (about[0], box[1], box[2])
         higher, score = peak(search, box)
     return higher, score
+
+
+def _holds(box: Sequence[range], other: Sequence[range]) -> bool:
+    return all(part[0] in whole and part[-1] in whole for whole, part in zip(box, other, strict=True))

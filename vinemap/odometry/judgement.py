@@ -247,19 +247,29 @@ def agreement_at(
     n = coarseness(view.image)
     source, target = ((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:]))
     matrix = warp(place.angle, source, target)
-    size, flags = b.shape[::-1], cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    moved = np.asarray(cv2.warpAffine(a, matrix, size, flags=flags), np.float32)
-    shown = cv2.warpAffine(np.ones_like(a), matrix, size, flags=flags) > 0.999
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    moved = np.asarray(cv2.warpAffine(a, matrix, b.shape[::-1], flags=flags), np.float32)
+    shown = _within(a.shape, matrix, b.shape)
     overlap = float(shown.mean())
     if overlap < LEAST_OVERLAP:
         return 0.0, overlap
     x, y = moved[shown], b[shown]
-    quadrants = np.mean(np.sign(x - _median(x)) * np.sign(y - _median(y)))
-    agreement = float(np.sin(np.pi / 2 * quadrants))
+    alike = np.count_nonzero((x > _median(x)) == (y > _median(y))) / len(x)
+    agreement = float(np.sin(np.pi * (alike - 0.5)))
     if np.hypot(*(source - target)) < NEAR_STILL:
         inner = np.s_[3:-3, 3:-3]
         agreement = agreement if change(moved[inner], b[inner]) < most_change else 0.0
     return agreement, overlap
+
+
+def _within(shape: tuple[int, ...], matrix: Values, next_shape: tuple[int, ...]) -> Flags:
+    """Which pixels (ny, nx) of the next image lie where the first has pixels all about."""
+    rows, columns = (np.arange(size) for size in next_shape)
+    within = np.ones(next_shape, bool)
+    for size, (by_column, by_row, offset) in zip(shape[::-1], matrix, strict=True):
+        middle = (size - 1) / 2
+        within &= np.abs(by_column * columns + (by_row * rows + offset - middle)[:, None]) <= middle - 1
+    return within
 
 
 def doubt(

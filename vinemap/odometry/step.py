@@ -20,7 +20,7 @@ from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
@@ -43,6 +43,9 @@ CLEAR_LEAD, LACKS = 0.5, 0.02
 they lack anyway."""
 FINE_SPREAD = 0.2
 """Pixels by which patches disagree from which on they know better where frames lie that they see more coarsely."""
+LIKELY, CHANCE = 0.4, 0.1
+"""Share of what agrees at the best place, known to some pixels only, that agrees at another that may be better when
+known well; and what agrees by chance."""
 LITTLE = 0.05
 """Share of a template that may show no ground."""
 UNSURE = (1.0, 1.0, 1e-4)
@@ -175,14 +178,13 @@ def motion_between(
     )
     if min(view.contrast, next_view.contrast) < LEAST_CONTRAST:
         return _motion(camera, centre, Place(0.0, *centre), None)._replace(flag="blank")
-    n = coarseness(view.image)
-    places, guess = _candidates(view, next_view, fine), expected and _place_of(camera, centre, expected)
-    peaks = [climb(fine, place, n + 1) for place in ([guess, *places[:-1]] if guess else places)]
-    if search == "exhaustive":
-        peaks.append(peak(fine, fine.whole))
     agree = partial(agreement_at, view, next_view, centre)
-    agreed = {index: agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)[0] for index, _ in peaks}
-    top, rival = _chosen(view, next_view, fine, agreed, guess)
+    places, guess = _candidates(view, next_view, fine), expected and _place_of(camera, centre, expected)
+    peaks = _peaks(fine, [guess, *places[:-1]] if guess else places, agree, coarseness(view.image) + 1)
+    if search == "exhaustive":
+        index, score = peak(fine, fine.whole)
+        peaks[index] = score, agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)[0]
+    top, rival = _chosen(view, next_view, fine, {index: agreed for index, (_, agreed) in peaks.items()}, guess)
     place = refine(fine, top, method)
     patches = patches_at(view, next_view, centre, place)
     fit = fit_of(patches, place, centre, camera.fx)
@@ -190,11 +192,31 @@ def motion_between(
         finer = patches.unit > 1 and fit.spread <= FINE_SPREAD
         place, fit = fit.turned(place) if finer else (fit.corrected(place), fit)
     agreement, overlap = agree(place, most_change=CHANGED if method == "aligned" else CHANGED_ROUGHLY)
-    score = dict(peaks)[top]
+    score, _ = peaks[top]
     at_limits = [not within[0] < value < within[-1] for value, within in zip(top, fine.whole, strict=True)]
     flag = doubt(view, next_view, at_limits, score=score, agreement=agreement, rival=rival, patches=patches, fit=fit)
     motion = _motion(camera, centre, place, fit)
     return motion._replace(score=score, agreement=agreement, rival=rival, overlap=overlap, flag=flag)
+
+
+def _peaks(
+    fine: Search, places: Sequence[Place], agree: Callable[..., tuple[float, float]], reach: int
+) -> dict[Index, tuple[float, float]]:
+    """Peaks near places known to some pixels, the template's correlation and what agrees there.
+
+    Places that agree too little beside the best, before they are climbed from, are left out.
+    """
+    peaks: dict[Index, tuple[float, float]] = {}
+    roughly = {place: agree(place, most_change=np.inf)[0] for place in places}
+    most = 0.0
+    for place in sorted(roughly, key=lambda place: -roughly[place]):
+        if roughly[place] < LIKELY * most - CHANCE:
+            break
+        index, score = climb(fine, place, reach)
+        agreed, _ = agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)
+        peaks[index] = score, agreed
+        most = max(most, min(agreed, roughly[place]))
+    return peaks
 
 
 def _chosen(
