@@ -78,12 +78,13 @@ def cut_sections(
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]
     numbers, spacing = rows["row_id"].to_numpy(), rows["spacing_m"].to_numpy()
+    bare, bare_rows = gaps[["start_m", "end_m"]].to_numpy(dtype=float), gaps["row_id"].to_numpy()
 
     def cut(one: tuple[Any, ...]) -> T:
         row, along, left, member, elevation, height = one
         stations = np.linspace(0, lines[row].length, max(2, round(lines[row].length / step) + 1))
         soil_line = sample(dtm, at(curves[row], stations))
-        canopied = _outside(gaps[gaps["row_id"] == numbers[row]], stations)
+        canopied = _outside(bare[bare_rows == numbers[row]], stations)
         position, level = stations[canopied], soil_line[canopied]
         top, half = size = canopy_size(left, height, float(spacing[row]), high)
         floor = canopy_floor(left, height, size, float(spacing[row]))
@@ -238,9 +239,7 @@ def _take_each(
     return points, heights, members
 
 
-def _outside(gaps: gpd.GeoDataFrame, position: Values) -> Flags:
-    """Whether positions (m,) along a row lie in none of its gaps."""
-    out = np.ones(len(position), dtype=bool)
-    for start, end in zip(gaps["start_m"], gaps["end_m"], strict=True):
-        out &= (position <= start) | (position >= end)
-    return out
+def _outside(bare: Values, position: Values) -> Flags:
+    """Whether positions (m,) along a row lie in none of its bare stretches (n, 2), ends aside."""
+    starts, ends = bare.T[..., None]
+    return np.asarray(((position <= starts) | (position >= ends)).all(axis=0))

@@ -141,13 +141,14 @@ def _stands(
     aside = np.linspace(-half, half, 2 * int(np.ceil(half / CELL)) + 1)
     covers = sample_across(cover, origin, np.column_stack([-along[:, 1], along[:, 0]]), aside).mean(axis=1)
     own = sections[sections["row_id"].isin(rows["row_id"])]
-    parts, density = dict(iter(own.groupby("row_id"))), (own["n_points"] / own["extent_m"]).median()
+    parts, density = own.groupby("row_id").indices, (own["n_points"] / own["extent_m"]).median()
+    places, areas = own[["position_m", "area_m2"]].to_numpy(dtype=float).T
     out = []
     profiles = np.split(covers, np.cumsum([len(station) for station in stations])[:-1])
     for i, length, station, profile, hidden in zip(rows["row_id"], lengths, stations, profiles, unseen, strict=True):
         canopy = _relative(profile)
         if i in parts:
-            position, area = (parts[i][name].to_numpy(dtype=float) for name in ("position_m", "area_m2"))
+            position, area = places[parts[i]], areas[parts[i]]
             nearest = np.rint(np.interp(station, position, np.arange(len(position)))).astype(np.int64)
             share = np.where(np.abs(position[nearest] - station) <= 0.4 * step, area[nearest] / np.median(area), 0)
             canopy = np.where(share > MODELLED, np.maximum(canopy, share), canopy)
