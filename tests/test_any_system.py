@@ -114,6 +114,7 @@ def test_only_signals_that_are_there_stop_it():
 
 def test_memory_where_the_system_does_not_tell(monkeypatch):
     monkeypatch.delattr(os, "sysconf", raising=False)
+    monkeypatch.setattr(processes, "Path", lambda path: Path(path.replace("/proc", "/no/proc")))
     assert machine.memory() <= 8 << 30
     assert processes.resident(os.getpid()) == 0
 

@@ -79,6 +79,14 @@ def test_memory_of_processes_is_summed():
     assert processes.resident(children[0].pid) == 0
 
 
+@LINUX
+def test_memory_that_processes_share_counts_once():
+    forked = "import os, time; x = bytearray(b'1') * 100_000_000; os.fork(); time.sleep(1.5)"
+    with processes.summed_memory() as most:
+        subprocess.run([sys.executable, "-c", forked], check=True)
+    assert 100e6 < most[0] < 150e6
+
+
 def test_a_survey_of_many_parcels(tmp_path):
     (heading, line) = many(0.15, 3, tmp_path)
     assert line[0] == "0.2 M points, 3 parcels"

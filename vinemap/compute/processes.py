@@ -86,11 +86,14 @@ def must(command: Sequence[str], *, env: Mapping[str, str] | None = None) -> Out
 
 @contextmanager
 def summed_memory() -> Iterator[list[int]]:
-    """Give what all processes begun meanwhile hold together (bytes), at the most; 0 where the system doesn't tell."""
+    """Give what all processes begun meanwhile hold together (bytes), at the most; 0 where the system doesn't tell.
+
+    What several share, as they do libraries, counts once.
+    """
     most, done, earlier = [0], threading.Event(), set(descendants(os.getpid()))
 
     def watch() -> None:
-        while not done.wait(0.1):
+        while not done.wait(0.2):
             most[0] = max(most[0], sum(map(resident, set(descendants(os.getpid())) - earlier)))
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -113,11 +116,12 @@ def descendants(process: int) -> list[int]:
 
 
 def resident(process: int) -> int:
-    """Memory (bytes) that a process holds; 0 if it has gone."""
+    """Memory (bytes) that a process holds, with its part of what it shares with others; 0 if it has gone."""
     try:
-        return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, AttributeError):  # on Windows there is neither
+        lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
+    except OSError:  # on Windows there is none
         return 0
+    return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
 
 
 def high_water(*, status: Path = Path("/proc/self/status"), reset: Path = Path("/proc/self/clear_refs")) -> int | None:
