@@ -8,8 +8,9 @@ import pytest
 from vinemap.config.camera import Camera
 from vinemap.errors import InputError
 from vinemap.measure.odometry.trials import template_error
+from vinemap.odometry.correlation import Place, search_of
 from vinemap.odometry.poses import Pose, moved
-from vinemap.odometry.step import estimate_motion
+from vinemap.odometry.step import estimate_motion, peaks_near
 from vinemap.simulate.camera import HIGH, LOW, Ground, Weather, lay_ground, render, rough, wander
 
 SIZE = (1000, 1000)
@@ -234,3 +235,19 @@ def test_other_frames_are_refused(shape, kind, says):
     good = np.zeros((240, 320), np.uint8)
     with pytest.raises(InputError, match=says):
         estimate_motion(good, np.zeros(shape, kind), camera=LOW)
+
+
+@pytest.mark.parametrize(("agreed", "n"), [(0.9, 1), (0.5, 3)])
+def test_only_beside_a_sure_place_are_others_left_out(agreed, n):
+    """However little agrees at a place that is known roughly, it may be the right one."""
+    image = np.random.default_rng(3).normal(size=(40, 60)).astype(np.float32)
+    fine = search_of(image, image, centre=(20, 30), half=6, step=1.15, angles=(-2, 2), cubic=True)
+    places = [Place(0.0, 20.0, column) for column in (14.0, 30.0, 46.0)]
+
+    def agree(place, *, most_change):
+        likely = place.column == 30.0
+        return (0.4 if likely else 0.05) if most_change == np.inf else (agreed if likely else 0.0), 1.0
+
+    peaks = peaks_near(fine, places, agree, 2)
+    assert len(peaks) == n
+    assert peaks[0, 20, 30] == (pytest.approx(1.0), agreed)

@@ -43,9 +43,9 @@ CLEAR_LEAD, LACKS = 0.5, 0.02
 they lack anyway."""
 FINE_SPREAD = 0.2
 """Pixels by which patches disagree from which on they know better where frames lie that they see more coarsely."""
-LIKELY, CHANCE = 0.4, 0.1
-"""Share of what agrees at the best place, known to some pixels only, that agrees at another that may be better when
-known well; and what agrees by chance."""
+SURE, LIKELY = 0.6, 0.25
+"""What agrees at a place that is hardly a wrong one; and the share of what agreed there, when it was known to some
+pixels only, which others so known must reach to be as good."""
 LITTLE = 0.05
 """Share of a template that may show no ground."""
 UNSURE = (1.0, 1.0, 1e-4)
@@ -180,7 +180,7 @@ def motion_between(
         return _motion(camera, centre, Place(0.0, *centre), None)._replace(flag="blank")
     agree = partial(agreement_at, view, next_view, centre)
     places, guess = _candidates(view, next_view, fine), expected and _place_of(camera, centre, expected)
-    peaks = _peaks(fine, [guess, *places[:-1]] if guess else places, agree, coarseness(view.image) + 1)
+    peaks = peaks_near(fine, [guess, *places[:-1]] if guess else places, agree, coarseness(view.image) + 1)
     if search == "exhaustive":
         index, score = peak(fine, fine.whole)
         peaks[index] = score, agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)[0]
@@ -199,23 +199,24 @@ def motion_between(
     return motion._replace(score=score, agreement=agreement, rival=rival, overlap=overlap, flag=flag)
 
 
-def _peaks(
+def peaks_near(
     fine: Search, places: Sequence[Place], agree: Callable[..., tuple[float, float]], reach: int
 ) -> dict[Index, tuple[float, float]]:
     """Peaks near places known to some pixels, the template's correlation and what agrees there.
 
-    Places that agree too little beside the best, before they are climbed from, are left out.
+    Once there is a sure one, places where much less agrees, however roughly they are known, are left out.
     """
     peaks: dict[Index, tuple[float, float]] = {}
     roughly = {place: agree(place, most_change=np.inf)[0] for place in places}
-    most = 0.0
+    most = -np.inf
     for place in sorted(roughly, key=lambda place: -roughly[place]):
-        if roughly[place] < LIKELY * most - CHANCE:
+        if roughly[place] < LIKELY * most:
             break
         index, score = climb(fine, place, reach)
         agreed, _ = agree(place_at(fine, index), most_change=CHANGED_ROUGHLY)
         peaks[index] = score, agreed
-        most = max(most, min(agreed, roughly[place]))
+        if agreed > SURE:
+            most = max(most, roughly[place])
     return peaks
 
 
