@@ -43,7 +43,7 @@ def tables(rows, *, unseen=()):
         hidden = np.isin(np.arange(len(place)), [k - 1 for row, k in unseen if row == i])
         there = place[~gone & ~hidden]
         length = place[-1] + extent / 2
-        lines.append((i, block, 0.5, 0, 1.0, shapely.LineString([[2, north, 100], [2 + length, north, 110]])))
+        lines.append((i, block, 0.5, 0.0, 0, 1.0, shapely.LineString([[2, north, 100], [2 + length, north, 110]])))
         canopy = np.abs(x[None, :] - 2 - there[:, None]).min(axis=0) <= extent / 2
         cover[np.ix_(np.abs(y - north) <= 0.25, canopy)] = 0.8
         stations = np.arange(STEP / 2, length, STEP)
@@ -53,10 +53,14 @@ def tables(rows, *, unseen=()):
         for a, b in edges[np.diff(edges, axis=1)[:, 0] > 0.8]:
             dark = ((place[hidden] > a) & (place[hidden] < b)).any()
             gaps.append((i, a, b, b - a, 1, "unseen" if dark else "missing"))
-    columns = ["row_id", "block", "width_m", "n_missing", "vine_spacing_m", "geometry"]
+    columns = ["row_id", "block", "width_m", "gap_m", "n_missing", "vine_spacing_m", "geometry"]
+    rows = pd.DataFrame(lines, columns=columns)
+    gaps = pd.DataFrame(gaps, columns=["row_id", "start_m", "end_m", "length_m", "n_missing", "state"])
+    seen = gaps[gaps["state"] == "missing"].groupby("row_id")["length_m"].sum()
+    rows["gap_m"] = seen.reindex(rows["row_id"], fill_value=0.0).to_numpy()
     return (
-        gpd.GeoDataFrame(pd.DataFrame(lines, columns=columns), crs=32632),
-        gpd.GeoDataFrame(pd.DataFrame(gaps, columns=["row_id", "start_m", "end_m", "length_m", "n_missing", "state"])),
+        gpd.GeoDataFrame(rows, crs=32632),
+        gpd.GeoDataFrame(gaps),
         pd.DataFrame(
             sections, columns=["row_id", "position_m", "height_m", "width_m", "area_m2", "n_points", "extent_m"]
         ),
@@ -82,6 +86,21 @@ def test_vines_stand_where_gaps_tell(spacing, extent):
     assert (vines["position_sd_m"] < 0.3 * spacing).all()
     assert out["n_missing"].tolist() == [gone.sum() for _, _, gone, *_ in rows]
     assert gaps["n_missing"].sum() == out["n_missing"].sum()
+
+
+@pytest.mark.parametrize(("spacing", "extent"), [(2.4, 0.9), (1.6, 0.5), (1.0, 1.1)])
+def test_the_space_between_vines_is_no_gap(spacing, extent):
+    """Where they stand apart; what is missing among them is one."""
+    told = tables(planted(spacing, extent=extent))
+    rows, gaps, vines = find_vines(*told)
+    gone = vines[vines["state"] == "missing"]
+    among = [
+        ((gone["row_id"] == g.row_id) & gone["position_m"].between(g.start_m, g.end_m)).sum() for g in gaps.itertuples()
+    ]
+    assert (gaps["n_missing"] > 0).all()
+    assert among == gaps["n_missing"].tolist()
+    lengths = gaps.groupby("row_id")["length_m"].sum().reindex(rows["row_id"], fill_value=0).to_numpy()
+    np.testing.assert_allclose(rows["gap_m"], lengths, atol=1e-9)
 
 
 def test_vines_lie_on_their_rows():

@@ -42,6 +42,8 @@ FEW = 4.0
 """Points that a bare stretch would have, if it were canopy, from which it is one: 1 in 50 has none by chance."""
 HALF = 0.5
 """Share of the volume of the block's median vine below which one is weak."""
+LEFT = 1.5
+"""Times the space that vines of a block usually leave between them, below which such a space is no gap."""
 
 
 class _Stand(NamedTuple):
@@ -66,9 +68,9 @@ def find_vines(
     Parameters
     ----------
     rows : GeoDataFrame
-        LineStringZ with ``row_id``, ``block``, ``width_m``, ``n_missing`` and ``vine_spacing_m``.
+        LineStringZ with ``row_id``, ``block``, ``width_m``, ``gap_m``, ``n_missing`` and ``vine_spacing_m``.
     gaps : GeoDataFrame
-        With ``row_id``, ``start_m``, ``end_m``, ``n_missing`` and ``state``.
+        With ``row_id``, ``start_m``, ``end_m``, ``length_m``, ``n_missing`` and ``state``.
     sections : GeoDataFrame
         Sections of these rows, by row and ``position_m``, with ``height_m``, ``width_m``, ``area_m2``, ``n_points``,
         ``extent_m``.
@@ -85,7 +87,8 @@ def find_vines(
     Returns
     -------
     rows, gaps : GeoDataFrame
-        With ``n_missing`` and ``vine_spacing_m`` by the vines, where there are any.
+        With ``n_missing`` and ``vine_spacing_m`` by the vines, where there are any; without gaps, and their length in
+        ``gap_m``, that are the space which vines usually leave between them.
     vines : GeoDataFrame
         PointZ with ``row_id``, ``number`` (from 1 at e1), ``position_m`` along γ and its standard deviation
         ``position_sd_m``, ``state``, and of the canopy nearest to the vine ``height_m``, ``width_m`` (means) and
@@ -103,7 +106,7 @@ def find_vines(
     if not all(usual):
         others = known_spacing(known.values()) or estimate_spacing([row for part in edges for row in part])
         usual = [one or others for one in usual]
-    spacing = rows["vine_spacing_m"].to_numpy(dtype=float, copy=True)
+    spacing, space = rows["vine_spacing_m"].to_numpy(dtype=float, copy=True), np.zeros(len(rows))
     tables = [pd.DataFrame(columns=["row", "position_m", "position_sd_m", "bare", "block"], dtype=float)]
     for own, part, told, theirs, apart in zip(members, stands, edges, given, usual, strict=True):
         if apart:
@@ -112,12 +115,12 @@ def find_vines(
             bare = _bare(part, row, position, CORE * min(extent, apart))
             columns = own[row], position, deviation, bare, np.full(len(row), block[own[0]])
             tables.append(pd.DataFrame(dict(zip(tables[0].columns, columns, strict=True))))
-            spacing[own] = apart
+            spacing[own], space[own] = apart, max(apart - extent, 0)
     table = pd.concat(tables[1:] or tables).astype({"row": np.int64, "bare": bool})
     table = table.sort_values(["row", "position_m"], ignore_index=True)
     rows = rows.assign(vine_spacing_m=spacing)
     vines = _described(table, rows, unseen, sections, step)
-    return *_counted(rows, gaps, vines), vines
+    return *_counted(rows, gaps, vines, space), vines
 
 
 def _unseen(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> list[Values]:
@@ -246,9 +249,12 @@ def _sizes(standing: pd.DataFrame, rows: gpd.GeoDataFrame, sections: gpd.GeoData
 
 
 def _counted(
-    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, vines: gpd.GeoDataFrame
+    rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame, vines: gpd.GeoDataFrame, space: Values
 ) -> tuple[gpd.GeoDataFrame, gpd.GeoDataFrame]:
-    """Rows and gaps with the missing vines of their own, where vines were placed in a row."""
+    """Rows and gaps with the missing vines of their own, where vines were placed in a row.
+
+    Gaps are left out that are hardly more than what vines of their row leave between them, ``space`` (rows,) metres.
+    """
     placed = set(vines["row_id"])
     gone = vines[vines["state"] == MISSING]
     own = gone.groupby("row_id").size().reindex(rows["row_id"], fill_value=0).to_numpy()
@@ -258,7 +264,10 @@ def _counted(
     way = np.sort((gone["row_id"] * far + gone["position_m"]).to_numpy())
     within = np.searchsorted(way, at_gaps + gaps["end_m"]) - np.searchsorted(way, at_gaps + gaps["start_m"])
     told = gaps["row_id"].isin(placed).to_numpy()
+    usual = pd.Series(LEFT * space, index=rows["row_id"]).reindex(gaps["row_id"]).to_numpy()
+    between = (within == 0) & (gaps["state"] == MISSING).to_numpy() & (gaps["length_m"].to_numpy() < usual)
+    lengths = gaps[between].groupby("row_id")["length_m"].sum().reindex(rows["row_id"], fill_value=0.0).to_numpy()
     return (
-        rows.assign(n_missing=np.where(known, own, rows["n_missing"])),
-        gaps.assign(n_missing=np.where(told, within, gaps["n_missing"])),
+        rows.assign(n_missing=np.where(known, own, rows["n_missing"]), gap_m=np.maximum(rows["gap_m"] - lengths, 0)),
+        gaps.assign(n_missing=np.where(told, within, gaps["n_missing"]))[~between].reset_index(drop=True),
     )

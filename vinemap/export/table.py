@@ -75,7 +75,7 @@ ROWS = KEYS | {
     "volume_m3": _real("m3", 3, "Volume of the foliage"),
     "trv_m3_ha": _real("m3/ha", 1, "Tree-row volume: height x width x 10,000 / spacing"),
     "lwa_m2_ha": _real("m2/ha", 1, "Leaf-wall area: both sides of the wall, on a hectare"),
-    "gap_m": _real("m", 3, "Length without canopy, as far as it was seen"),
+    "gap_m": _real("m", 3, "Length of its gaps, as far as it was seen"),
     "n_missing": _whole("Vines missing in it, as far as it was seen"),
     "unseen_m": _real("m", 3, "Length of which the cloud shows nothing: neither canopy nor gap"),
     "support": _real("1", 4, "Share of its length that has canopy, as far as it was seen"),

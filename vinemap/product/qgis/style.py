@@ -45,7 +45,7 @@ WORDS = {
     "canopy_confidence": "Confidence in the canopy's numbers",
     "mesh_error_m": "Distance of the foliage's surface to the mesh (m)",
     "elevation_diff_m": "Elevation difference en − e1 (m)",
-    "gap_m": "Length without canopy (m)",
+    "gap_m": "Length of gaps (m)",
     "unseen_m": "Length that was not seen (m)",
     "state": "State: what stands there",
     "beyond": "What is beyond that end",

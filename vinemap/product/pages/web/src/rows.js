@@ -16,7 +16,7 @@ const COLUMNS = [
   ["volume_m", "Volume a metre", "m³/m", 3, "Volume over length, gaps included, but for what was not seen"],
   ["trv_m3_ha", "TRV", "m³/ha", 0, "Tree-row volume"],
   ["lwa_m2_ha", "LWA", "m²/ha", 0, "Leaf-wall area"],
-  ["gap_m", "Gaps", "m", 2, "Length without canopy, as far as it was seen"],
+  ["gap_m", "Gaps", "m", 2, "Length of its gaps, as far as it was seen"],
   ["n_missing", "Missing", "vines", 0, "Vines missing in it, as far as it was seen"],
   ["unseen_m", "Not seen", "m", 2, "Length of which the points show nothing, neither vines nor gaps"],
   ["support", "Support", "", 2, "Share of the length that was seen with canopy"],
