@@ -86,3 +86,12 @@ def test_known_rows_that_cross_each_other_are_odd():
     lines = [[(0, 0), (30, 0)], [(0, 3), (30, 3)], [(0, -1), (30, 4)]]
     rows = rows_frame(lines, block=1, support=1.0, cut=0.0)
     assert flag_rows(rows)["flags"].tolist() == ["spacing"] * 3
+
+
+@pytest.mark.parametrize(
+    ("support", "flags"), [([0.3, 0.35, 0.3, 0.1], ["", "", "", "sparse"]), ([0.9, 0.4], ["", "sparse"])]
+)
+def test_rows_of_bushes_are_sparse_beside_each_other_alone(support, flags):
+    lines = [[(0, 3 * k), (30, 3 * k)] for k in range(len(support))]
+    rows = rows_frame(lines, block=1, support=support, cut=0.0)
+    assert flag_rows(rows)["flags"].tolist() == flags

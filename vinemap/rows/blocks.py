@@ -22,7 +22,7 @@ ODD_SPACING = 1.5
 SHORT = 0.5
 """Share of the block's median length below which a row is short."""
 SPARSE = 0.5
-"""Share of its length with canopy below which a row is sparse."""
+"""Share of what is usual in the block, or of all, that a row must have of canopy along it not to be sparse."""
 BOW = 0.5
 """Metres by which a row's bow may differ from its neighbours'."""
 CUT = 0.05
@@ -88,8 +88,9 @@ def flag_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     """Give rows ``flags``, what is odd about each, in words separated by commas.
 
     They are ``spacing`` (its nearest neighbour is half as far again as is usual in the block, or two thirds as far),
-    ``short`` (less than half the block's median length), ``sparse`` (canopy on less than half of it), ``curved``
-    (its bow differs from its neighbours') and ``edge`` (what was seen ends within its canopy, along 5% of it or more).
+    ``short`` (less than half the block's median length), ``sparse`` (less than half of the block's median share of its
+    length has canopy; of all of it, in blocks of one or two), ``curved`` (its bow differs from its neighbours') and
+    ``edge`` (what was seen ends within its canopy, along 5% of it or more).
 
     Parameters
     ----------
@@ -98,7 +99,9 @@ def flag_rows(rows: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     """
     lines = shapely.force_2d(rows.geometry.to_numpy())
     length = shapely.length(lines)
-    odd = {"edge": rows["cut"].to_numpy() >= CUT, "sparse": rows["support"].to_numpy() < SPARSE}
+    support = rows["support"]
+    usual = support.groupby(rows["block"]).transform(lambda own: own.median() if len(own) > 2 else 1.0)
+    odd = {"edge": rows["cut"].to_numpy() >= CUT, "sparse": (support < SPARSE * usual).to_numpy()}
     flags: list[list[str]] = [[name for name in odd if odd[name][i]] for i in range(len(rows))]
     for _, members in rows.reset_index(drop=True).groupby("block"):
         index = members.index.to_numpy()
