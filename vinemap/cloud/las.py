@@ -211,6 +211,8 @@ def opened(path: Path, *, crs: CRS | None = None) -> Iterator[tuple[Any, CRS, La
     except BaseException as error:
         raise unreadable(path, error) from error
     with reader:
+        if reader.header.point_count == 0:
+            raise EmptyError(f"{path}: holds no points")
         source = crs_of(reader.header, crs, path)
         _check_header(reader.header, source, path)
         yield reader, source, layout
@@ -225,8 +227,6 @@ def _backends(layout: Layout) -> Any:
 
 
 def _check_header(header: Any, crs: CRS, path: Path) -> None:
-    if header.point_count == 0:
-        raise EmptyError(f"{path}: holds no points")
     numbers = np.concatenate([header.scales, header.offsets])
     if not (np.abs(numbers) < FARTHEST).all() or (np.abs(header.scales) < FINEST).any():
         raise InputError(f"{path}: scale or offset in its header is no number that a place has: write the file again")

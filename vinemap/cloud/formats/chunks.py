@@ -55,7 +55,7 @@ def other_chunks(
     points = _opened(path, kind, crs, around, engine)
     with closing(points.chunks) as chunks, reading(path, WORDS.get(kind, kind.upper())):
         first = next((chunk for chunk in chunks if len(chunk)), None)
-        if first is None and around is None:
+        if first is None and (around is None or kind in WHOLE):
             raise EmptyError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
         if first is None:
             return

@@ -8,7 +8,7 @@ import numpy as np
 
 from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable, whole_steps
 from vinemap.compute.extras import load
-from vinemap.errors import InputError
+from vinemap.errors import EmptyError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -39,7 +39,7 @@ def read_e57(path: Path) -> Points:
         n = sum(file.get_header(k).point_count for k in range(file.scan_count))
         stated = file.root["coordinateMetadata"].value() if file.root.isDefined("coordinateMetadata") else ""
     if n == 0:
-        raise InputError(f"{path}: holds no points")
+        raise EmptyError(f"{path}: holds no points")
     return Points(Header(stated.strip(), point_count=n), _read(path, pye57))
 
 

@@ -7,7 +7,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.cloud.formats.told import CHUNK, Header, Points, is_class, reading, usable
-from vinemap.errors import InputError
+from vinemap.errors import EmptyError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -44,17 +44,23 @@ def read_text(path: Path) -> Points:
     Raises
     ------
     InputError
-        If no x, y and z can be told, or more than one column may be one of them.
+        If it holds no points, no x, y and z can be told, or more than one column may be one of them.
     """
     with reading(path, "text"), path.open("rb") as stream:
         beginning = stream.read(BEGINNING)
         if b"\0" in beginning:
             raise InputError(f"{path}: can't be read as text: it is packed: which program wrote it, and as what?")
         lines = beginning.decode("utf-8-sig", "replace").splitlines()
-    return Points(Header(), _read(path, _form(lines[:-1] if len(beginning) == BEGINNING else lines, path)))
+    whole = len(beginning) < BEGINNING
+    if form := _form(lines if whole else lines[:-1], path):
+        return Points(Header(), _read(path, form))
+    if whole and sum(map(_is_said, lines)) < 2:
+        raise EmptyError(f"{path}: holds no points")
+    raise InputError(f"{path}: no line of it begins with x, y and z, nor do names say which columns they are")
 
 
-def _form(lines: Sequence[str], path: Path) -> _Form:
+def _form(lines: Sequence[str], path: Path) -> _Form | None:
+    """How a file is written by its first lines; None if none of them is a point."""
     names: list[str] = []
     for skip, line in enumerate(lines):
         bare = line.strip().lstrip("#/;% ") if line.strip().startswith(COMMENTS) else line.strip()
@@ -70,7 +76,12 @@ def _form(lines: Sequence[str], path: Path) -> _Form:
             classes = next((k for k, name in enumerate(told) if is_class(name)), None)
             decimal = "," if sep != "," and any("," in word for word in cleaned[:3]) else "."
             return _Form(skip, sep, decimal, _columns(told, path), classes)
-    raise InputError(f"{path}: no line of it begins with x, y and z, nor do names say which columns they are")
+    return None
+
+
+def _is_said(line: str) -> bool:
+    """Whether a line holds something beside a comment: a point, names, or how many points follow."""
+    return bool(line.strip()) and not line.strip().startswith(COMMENTS)
 
 
 def _columns(names: Sequence[str], path: Path) -> tuple[int, int, int]:
