@@ -307,7 +307,7 @@ def _shown_steps(sample: Floats, scales: Floats) -> list[float]:
     A scanner that drives along an axis leaves profiles at even steps of it alone, which is no rounding. Steps of single
     precision are powers of two, to the scales (3,) in which they were stored since.
     """
-    x, y, z = (_step(column) for column in sample.T)
+    x, y, z = (step_of(column) for column in sample.T)
     if not np.isclose(x, y, rtol=ALIKE):
         x, y = (
             step if step > 0 and abs(step - 2.0 ** np.rint(np.log2(step))) <= scale else 0.0
@@ -316,7 +316,7 @@ def _shown_steps(sample: Floats, scales: Floats) -> list[float]:
     return [x, y, z]
 
 
-def _step(values: Floats) -> float:
+def step_of(values: Floats) -> float:
     """Steps between values (n,) that many share; 0 where few do."""
     known = np.unique(values)
     return float(np.quantile(np.diff(known), LEAST)) if 2 < len(known) < FEW * len(values) else 0.0

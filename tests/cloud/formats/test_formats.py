@@ -3,10 +3,8 @@
 import json
 
 import formats
-import geopandas as gpd
 import numpy as np
 import pytest
-import rasterio
 import shapely
 from pyproj import CRS
 
@@ -18,7 +16,6 @@ from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.las import read_cloud
 from vinemap.compute import extras
 from vinemap.errors import DependencyError, InputError
-from vinemap.parcel import map_parcel
 
 UTM = CRS.from_epsg(32632)
 HEAD = "element camera 2\nproperty float x\nproperty int k\n"
@@ -240,65 +237,3 @@ def test_tiles_packed_in_another_way(tmp_path, points):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"dataType": "zstandard"}))
     with pytest.raises(InputError, match="its points are packed as zstandard: export them as LAZ or COPC"):
         read_cloud(path)
-
-
-def test_a_surface_model_is_a_point_a_pixel(tmp_path):
-    xyz = np.array([[0.1, 0.1, 5], [0.1, 0.1, 6], [0.6, 0.1, 7], [0.1, 0.6, 8]]) + [414_700, 4_940_700, 0]
-    path = formats.write_surface(tmp_path / "a.tif", xyz, UTM, resolution=0.5)
-    cloud = read_cloud(path)
-    assert cloud.crs == UTM
-    assert in_order(cloud.xyz - [414_700, 4_940_700, 0]).tolist() == [[0.25, 0.25, 6], [0.75, 0.25, 7], [0.25, 0.75, 8]]
-    part = read_cloud(path, boundary=(shapely.box(414_700.1, 4_940_700.1, 414_700.4, 4_940_700.4), UTM))
-    assert part.xyz[:, 2].tolist() == [6]
-    with rasterio.open(path, "r+") as raster:
-        raster.nodata = None
-    assert np.array_equal(read_cloud(path).xyz, cloud.xyz)
-
-
-@pytest.mark.parametrize(
-    ("unit", "crs", "corner", "metres"),
-    [("ft", 32632, (414_700, 4_940_700, 0), 0.3048), ("metre", 2226, (6_475_000, 1_907_000, 0), 1.0)],
-)
-def test_heights_of_a_surface_model_are_in_the_unit_that_it_states(tmp_path, unit, crs, corner, metres):
-    xyz = np.array([[0.1, 0.1, 600], [0.6, 0.1, 700]]) + corner
-    path = formats.write_surface(tmp_path / "a.tif", xyz, CRS.from_epsg(crs), resolution=0.5)
-    with rasterio.open(path, "r+") as raster:
-        raster.units = (unit,)
-    assert sorted(read_cloud(path).xyz[:, 2]) == pytest.approx([600 * metres, 700 * metres])
-    given = read_cloud(path, crs=CRS.from_user_input(f"EPSG:{crs}+6360"))
-    assert sorted(given.xyz[:, 2]) == pytest.approx([600 * 1200 / 3937, 700 * 1200 / 3937])
-
-
-def test_zeros_of_a_surface_model_are_land_only_beside_land_at_sea_level(tmp_path):
-    xyz = np.array([[0.1, 0.1, 0.0], [0.6, 0.1, 0.0], [0.1, 0.6, 8], [0.6, 0.6, 3]]) + [414_700, 4_940_700, 0]
-    assert len(read_cloud(formats.write_surface(tmp_path / "a.tif", xyz, UTM, resolution=0.5)).xyz) == 4
-    xyz[2:, 2] += 400
-    inland = read_cloud(formats.write_surface(tmp_path / "b.tif", xyz, UTM, resolution=0.5))
-    assert sorted(inland.xyz[:, 2]) == [403, 408]
-
-
-def test_a_photograph_is_no_surface_model(tmp_path):
-    how = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": 4, "height": 4, "crs": UTM.to_wkt()}
-    with rasterio.open(tmp_path / "a.tif", "w", transform=rasterio.Affine(1, 0, 0, 0, -1, 9), **how):
-        pass
-    with pytest.raises(InputError, match=r"a\.tif: is a photograph, or several rasters in one"):
-        read_cloud(tmp_path / "a.tif")
-
-
-def test_rows_of_a_surface_model(tmp_path, vineyard):
-    """They are where they are and as high as they are; what it doesn't show isn't told."""
-    path = formats.write_surface(tmp_path / "dsm.tif", vineyard.xyz, UTM, resolution=0.08)
-    summary = map_parcel([path], tmp_path / "A", parcel="A")
-    rows = gpd.read_file(tmp_path / "A" / "A.gpkg", layer="rows")
-    truth = vineyard.rows.geometry
-    nearest = [
-        int(truth.distance(shapely.line_interpolate_point(line, 0.5, normalized=True)).argmin())
-        for line in rows.geometry
-    ]
-    assert sorted(nearest) == list(range(6))
-    for line, k in zip(rows.geometry, nearest, strict=True):
-        assert shapely.hausdorff_distance(shapely.force_2d(line), shapely.force_2d(truth.iloc[k])) < 0.2
-    assert np.abs(rows["height_m"] - vineyard.rows["mean_height"].to_numpy()[nearest]).max() < 0.1
-    assert rows[["bottom_m", "lwa_m2_ha"]].isna().all(axis=None)
-    assert any("dsm.tif is a surface model" in warning for warning in summary.warnings)
-    assert json.loads((tmp_path / "A" / "run.json").read_text())["settings"]["polygon"]["foot"] == "soil"

@@ -11,7 +11,7 @@ from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
 from vinemap.errors import InputError
 from vinemap.geo.crs import vertical, vertical_unit
 from vinemap.geo.place import doubts_of_heights
-from vinemap.geo.stated import crs_of
+from vinemap.geo.stated import crs_of, step_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from vinemap.cloud.formats.box import Box
-    from vinemap.compute.arrays import Floats, Values
+    from vinemap.compute.arrays import Flags, Floats, Values
     from vinemap.geo.boundaries import Boundary
 
 LOWEST, HIGHEST = -1_000.0, 30_000.0
@@ -29,6 +29,10 @@ NEAR_ZERO = 10.0
 """Metres or feet from 0 beyond which land lies where 0 stands for nothing, as rasters without nodata are filled up."""
 NEAREST = 0.01
 """Share of the land's pixels that may lie nearer, as those blended with the filling do."""
+LOOKED_AT = 32
+"""Lines of a raster that tell both, evenly over it."""
+COARSE = 0.2
+"""Metres of a step in heights from which on canopies are hardly more than one."""
 UNITS = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
@@ -43,7 +47,7 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     Raises
     ------
     InputError
-        If it is none, or is a photograph.
+        If it is none, or is a photograph or a picture of one.
     """
     import rasterio
     from rasterio.enums import ColorInterp
@@ -51,8 +55,10 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     with reading(path, "GeoTIFF"), rasterio.open(path) as raster:
-        if raster.count - (ColorInterp.alpha in raster.colorinterp) != 1 or raster.dtypes[0] == "uint8":
+        if raster.count - (ColorInterp.alpha in raster.colorinterp) != 1:
             raise InputError(f"{path}: is a photograph, or several rasters in one: give the surface model alone")
+        if raster.dtypes[0] == "uint8":
+            raise InputError(f"{path}: is a picture of 256 greys: give the surface model itself, as heights")
         if raster.transform.is_identity:
             raise InputError(f"{path}: has no place: export the surface model as GeoTIFF, with its coordinates")
         corners = _placed(raster, np.array([0, 0, raster.height, raster.height]), np.array([0, raster.width] * 2))
@@ -63,41 +69,58 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
             point_count=raster.width * raster.height,
         )
         unit = UNITS.get((raster.units[0] or "").strip().lower())
+        some = _some_heights(raster)
     remark = (
         f"{path.name} is a surface model, which shows canopies from above alone: their meshes reach down to the soil, "
         "where foliage begins isn't known (bottom_m, lwa_m2_ha), and volumes are of what was seen"
     )
     source = crs_of(header, crs, path)
     size = unit / vertical_unit(source) if unit and not vertical(source) else 1.0
-    remarks = remark, *(() if unit else doubts_of_heights(source))
-    return Points(header, _read(path, box_about(around, header, crs, path), size), remarks, steps=False)
+    step = step_of(some) * size * vertical_unit(source)
+    coarse = f"{path.name} has heights in steps of {step:.2g} m, in which canopies hardly show: export it with decimals"
+    remarks = remark, *([coarse] if step > COARSE else []), *(() if unit else doubts_of_heights(source))
+    chunks = _read(path, box_about(around, header, crs, path), size, zeros=_are_land(some))
+    return Points(header, chunks, remarks, steps=False)
 
 
-def _read(path: Path, box: Box, size: float) -> Generator[Floats]:
-    """Points (n, 3) of what meets a box, chunk by chunk; ``size`` is that of the raster's unit in that of heights."""
+def _some_heights(raster: Any) -> Floats:
+    """Heights (n,) along some lines of a raster."""
+    rows = np.unique(np.linspace(0, raster.height - 1, LOOKED_AT).round().astype(int))
+    lines = (_heights(raster, row, 1, 0, raster.width) for row in rows.tolist())
+    return np.concatenate([heights[seen] for heights, seen in lines])
+
+
+def _are_land(some: Floats) -> bool:
+    """Whether zeros among the heights (n,) of a raster are land, and don't stand for nothing."""
+    land = np.abs(some[some != 0])
+    return bool(len(land)) and float(np.quantile(land, NEAREST)) <= NEAR_ZERO
+
+
+def _read(path: Path, box: Box, size: float, *, zeros: bool) -> Generator[Floats]:
+    """Points (n, 3) of what meets a box, chunk by chunk, those of height 0 among them or not.
+
+    ``size`` is that of the raster's unit in that of heights.
+    """
     import rasterio
 
     with rasterio.open(path) as raster:
         first, last, left, right = _part(raster, box)
     rows = max(1, CHUNK // max(1, right - left))
     for row in range(first, last, rows):
-        yield _strip(path, row, min(rows, last - row), left, right - left) * [1.0, 1.0, size]
+        with rasterio.open(path) as raster:  # anew, as GDAL keeps to the thread that opened it
+            heights, seen = _heights(raster, row, min(rows, last - row), left, right - left)
+            i, j = np.nonzero(seen if zeros else seen & (heights != 0))
+            xyz = np.column_stack([_placed(raster, i + row + 0.5, j + left + 0.5), heights[i, j] * size])
+        yield usable(xyz)
 
 
-def _strip(path: Path, row: int, rows: int, column: int, columns: int) -> Floats:
-    """Points (n, 3) of some rows and columns; the file is opened for them, as GDAL keeps to the thread that did."""
-    import rasterio
+def _heights(raster: Any, row: int, rows: int, column: int, columns: int) -> tuple[Floats, Flags]:
+    """Heights of some rows and columns, and which of them are some."""
     from rasterio.windows import Window
 
     window = Window(column, row, columns, rows)
-    with rasterio.open(path) as raster:
-        heights = raster.read(1, window=window).astype(float) * raster.scales[0] + raster.offsets[0]
-        seen = (raster.read_masks(1, window=window) > 0) & (heights > LOWEST) & (heights < HIGHEST)
-        land = np.abs(heights[seen & (heights != 0)])
-        if len(land) == 0 or np.quantile(land, NEAREST) > NEAR_ZERO:
-            seen &= heights != 0
-        i, j = np.nonzero(seen)
-        return usable(np.column_stack([_placed(raster, i + row + 0.5, j + column + 0.5), heights[i, j]]))
+    heights = raster.read(1, window=window).astype(float) * raster.scales[0] + raster.offsets[0]
+    return heights, (raster.read_masks(1, window=window) > 0) & (heights > LOWEST) & (heights < HIGHEST)
 
 
 def _placed(raster: Any, rows: Values, columns: Values) -> Floats:
