@@ -143,7 +143,7 @@ def _vertical(header: Any) -> CRS | None:
             continue  # of a file whose CRS is given
     keys = _keys(records)
     code, datum, unit = (keys[key].value_offset if key in keys else 0 for key in (VERTICAL, DATUM, VERTICAL_UNIT))
-    metres = _units().get(unit)
+    metres = _units().get(unit) or getattr(header, "axis_units", {}).get("z")
     if code in ELLIPSOIDS or _is_geographic(code):
         return CRS.from_wkt(HEIGHTS.format(ELLIPSOIDAL, ELLIPSOIDAL, metres or 1.0))
     known = _vertical_of(code + 600 if code in DATUMS else code)

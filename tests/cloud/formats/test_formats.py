@@ -16,6 +16,7 @@ from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.las import read_cloud
 from vinemap.compute import extras
 from vinemap.errors import DependencyError, InputError
+from vinemap.geo.crs import parse_crs
 
 UTM = CRS.from_epsg(32632)
 HEAD = "element camera 2\nproperty float x\nproperty int k\n"
@@ -174,6 +175,41 @@ def test_columns_are_told_by_the_likeliest_names(tmp_path, names, order):
     (tmp_path / "a.csv").write_text(f"{names}\n{','.join(values)}\n")
     (found,) = read_text(tmp_path / "a.csv").chunks
     assert found.tolist() == [[414_700, 4_940_700, 469]]
+
+
+FEET, SURVEY = 0.3048, 1200 / 3937
+
+
+@pytest.mark.parametrize(
+    ("names", "metres"),
+    [
+        ("X,Y,Z", 1),
+        ("X(m),Y(m),Z [ft]", FEET),
+        ("Easting,Northing,Elevation (US ft)", SURVEY),
+        ("x,y,height_ft", FEET),
+        ("x,y,Z (US survey feet)", SURVEY),
+        ("x,y,Z (NAVD88)", 1),
+        ("X (m) Y (m) Z [US ft]", SURVEY),
+    ],
+)
+def test_heights_are_in_the_unit_behind_their_name(tmp_path, points, names, metres):
+    sep = "," if "," in names else " "
+    path = formats.write_text(tmp_path / "a.csv", points[:100], head=f"{names}\n", sep=sep)
+    assert read_cloud(path, crs=UTM).xyz[:, 2] == pytest.approx(metres * points[:100, 2])
+
+
+@pytest.mark.parametrize(
+    ("names", "crs", "said"),
+    [
+        ("X [ft],Y,Z", "EPSG:32632", "its x tells a unit of 0.3048 m, but WGS 84 / UTM zone 32N has metre"),
+        ("X,Y,Z [ft]", "EPSG:32632+5773", r"its z tells a unit of 0.3048 m, but .* EGM96 height has 1 m"),
+        ("X,Y,Z [ft]", "local", "its z tells a unit of 0.3048 m, but local metres has 1 m"),
+    ],
+)
+def test_a_unit_behind_a_name_that_is_not_the_crss_is_refused(tmp_path, points, names, crs, said):
+    path = formats.write_text(tmp_path / "a.csv", points[:100], head=f"{names}\n", sep=",")
+    with pytest.raises(InputError, match=rf"a\.csv: the name of {said}: give the CRS that the coordinates have"):
+        read_cloud(path, crs=parse_crs(crs))
 
 
 def test_what_stands_before_the_points(tmp_path, points):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -19,6 +20,7 @@ from vinemap.cloud.formats.text import read_text
 from vinemap.cloud.formats.told import Header, reading
 from vinemap.cloud.pdal.reader import read_pdal
 from vinemap.errors import EmptyError, InputError
+from vinemap.geo.crs import horizontal, vertical_unit
 from vinemap.geo.place import check_place, doubts_of
 from vinemap.geo.stated import crs_of, examined
 
@@ -37,6 +39,9 @@ PARTS = {"ept": read_ept, "surface": read_surface, "remote": read_remote}
 """Formats of which only what lies about a polygon is read."""
 WORDS = {"text": "text", "surface": "GeoTIFF", "remote": "COPC"}
 """What formats are called whose names aren't those of files."""
+
+ALIKE = 1e-5
+"""Share by which units of one name may differ, as both kinds of feet do."""
 
 
 def other_chunks(
@@ -61,6 +66,7 @@ def other_chunks(
             return
         header = _with_box(points, first)
         source = crs_of(header, crs, named)
+        _check_units(header, source, named)
         remarks += [*_checked(first, points, header, source, named, given=crs is not None), *points.remarks]
         yield first, source
         for chunk in chunks:
@@ -88,7 +94,20 @@ def _with_box(points: Points, first: Floats) -> Header:
     header = points.header
     if not isinstance(header, Header) or np.isfinite(header.mins[:2]).all():
         return header
-    return Header(header.wkt, first.min(axis=0), first.max(axis=0), header.scales, len(first))
+    return replace(header, mins=first.min(axis=0), maxs=first.max(axis=0), point_count=len(first))
+
+
+def _check_units(header: Header, source: CRS, path: Path) -> None:
+    """Make sure that coordinates are in the units of their CRS, where a file tells units of its own."""
+    flat = horizontal(source)
+    units = [(axis, flat.axis_info[0].unit_name, flat.axis_info[0].unit_conversion_factor) for axis in "xy"]
+    for axis, name, metres in (*units, ("z", f"{vertical_unit(source):g} m", vertical_unit(source))):
+        told = getattr(header, "axis_units", {}).get(axis, metres)
+        if not np.isclose(told, metres, rtol=ALIKE):
+            raise InputError(
+                f"{path}: the name of its {axis} tells a unit of {told:g} m, but {source.name} has {name}: give the "
+                "CRS that the coordinates have with --crs, or rename the column"
+            )
 
 
 def _checked(first: Floats, points: Points, header: Header, source: CRS, path: Path, *, given: bool) -> list[str]:

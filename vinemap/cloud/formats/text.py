@@ -10,7 +10,7 @@ from vinemap.cloud.formats.told import CHUNK, Header, Points, is_class, reading,
 from vinemap.errors import EmptyError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Generator, Mapping, Sequence
     from pathlib import Path
 
     from vinemap.compute.arrays import Floats
@@ -24,6 +24,16 @@ ELEVATIONS = ("z", "elevation", "altitude", "alt", "height", "h")
 """What columns of x, y and z are called, the likeliest first; of the former two those of one kind go together."""
 ABOVE_GROUND = re.compile(r"h(eight)?[\W_]*above|[\W_]agl\b")
 """Names of heights that are no elevations."""
+UNITS = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+    **dict.fromkeys(("usft", "ftus", "sft", "ussft"), 1200 / 3937),
+}
+"""Metres of units that names of columns may hold."""
+SURVEY = ("us", "survey")
+"""Words beside feet by which they are those of the US survey."""
 NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 
 
@@ -36,6 +46,8 @@ class _Form(NamedTuple):
     decimal: str
     columns: tuple[int, int, int]
     classes: int | None = None
+    units: Mapping[str, float] = {}
+    """Metres of the units of x, y and z, as far as names tell them."""
 
 
 def read_text(path: Path) -> Points:
@@ -53,7 +65,7 @@ def read_text(path: Path) -> Points:
         lines = beginning.decode("utf-8-sig", "replace").splitlines()
     whole = len(beginning) < BEGINNING
     if form := _form(lines if whole else lines[:-1], path):
-        return Points(Header(), _read(path, form))
+        return Points(Header(axis_units=form.units), _read(path, form))
     if whole and sum(map(_is_said, lines)) < 2:
         raise EmptyError(f"{path}: holds no points")
     raise InputError(f"{path}: no line of it begins with x, y and z, nor do names say which columns they are")
@@ -65,7 +77,7 @@ def _form(lines: Sequence[str], path: Path) -> _Form | None:
     for skip, line in enumerate(lines):
         bare = line.strip().lstrip("#/;% ") if line.strip().startswith(COMMENTS) else line.strip()
         for sep in (";", "\t", ",", r"\s+"):
-            words = re.split(sep, bare)
+            words = re.split(sep, _tight(bare) if sep == r"\s+" else bare)
             if len(words) < 3 or (sep == "," and re.fullmatch(r"[-+]?\d+,\d+(\s.*)?", bare)):
                 continue
             cleaned = [word.strip(" \"'") for word in words]
@@ -75,8 +87,15 @@ def _form(lines: Sequence[str], path: Path) -> _Form | None:
             told = names if len(names) == len(cleaned) else []
             classes = next((k for k, name in enumerate(told) if is_class(name)), None)
             decimal = "," if sep != "," and any("," in word for word in cleaned[:3]) else "."
-            return _Form(skip, sep, decimal, _columns(told, path), classes)
+            columns = _columns(told, path)
+            units = {axis: unit for axis, k in zip("xyz", columns, strict=True) if told and (unit := _unit(told[k]))}
+            return _Form(skip, sep, decimal, columns, classes, units)
     return None
+
+
+def _tight(line: str) -> str:
+    """Names without the spaces within and before brackets, which don't part them."""
+    return re.sub(r"\s*([\[(][^\])]*[\])])", lambda unit: "_".join(unit[1].split()), line)
 
 
 def _is_said(line: str) -> bool:
@@ -106,6 +125,13 @@ def _axes(names: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
     plans = ((_called(east, by), _called(north, by)) for by in (alone, first) for east, north in kinds)
     x, y = next((plan for plan in plans if all(plan)), ([], []))
     return x, y, _called(ELEVATIONS, alone) or _called(ELEVATIONS, first)
+
+
+def _unit(name: str) -> float | None:
+    """Metres of the unit that stands behind a column's name, as in "Z [ft]", "height_m" and "Elevation (US ft)"."""
+    words = re.findall(r"[a-z]+", name.lower())[1:]
+    unit = next((UNITS[word] for word in words if word in UNITS), None)
+    return UNITS["usft"] if unit == UNITS["ft"] and any(word in SURVEY for word in words) else unit
 
 
 def _called(words: Sequence[str], names: Sequence[str]) -> list[int]:

@@ -13,7 +13,7 @@ from pyproj.exceptions import CRSError
 from vinemap.errors import PASSING, BusyError, InputError, VinemapError
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator, Sequence
+    from collections.abc import Generator, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -39,6 +39,8 @@ class Header:
     maxs: Floats = field(default_factory=lambda: UNKNOWN)
     scales: Floats = field(default_factory=lambda: np.zeros(3))
     point_count: int = 0
+    axis_units: Mapping[str, float] = field(default_factory=dict)
+    """Metres of the units in which x, y and z are told to be."""
     evlrs: tuple[()] = ()
 
     @property
