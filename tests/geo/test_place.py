@@ -7,12 +7,14 @@ import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
+from formats import write_text
 from pyproj import CRS, Transformer
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
+from vinemap.cloud.las import read_cloud
 from vinemap.errors import GridError, InputError
 from vinemap.geo.crs import LOCAL, from_wgs84, horizontal, metric_crs, parse_crs, stated, to_wgs84, vertical_name
-from vinemap.geo.place import check_place, doubts_of
+from vinemap.geo.place import check_place, doubts_of, doubts_of_order
 
 FOOT = 0.3048
 SHIFT = "TOWGS84[590.5,69.5,411.6,-0.796,-0.052,-3.601,8.3]"
@@ -214,3 +216,27 @@ def test_local_coordinates_have_no_place():
     assert metric_crs(LOCAL, 3.0, 4.0) == LOCAL
     assert np.isnan(to_wgs84([[1.0, 2.0, 3.0]], LOCAL)).all()
     assert stated(LOCAL) == LOCAL
+
+
+@pytest.mark.parametrize(("lon", "lat"), [(7.924, 44.612), (-8.0, 41.2), (19.0, -33.9), (-40.5, -9.4), (38.7, 7.9)])
+def test_degrees_with_latitude_first_are_told(lon, lat):
+    """As vines of the tropics are, for which nobody can know."""
+    told = (
+        "are taken for longitude and latitude: if they are the other way round, export the cloud with longitude first"
+    )
+    north = abs(lat) > 25
+    (doubt,) = doubts_of_order(CRS.from_epsg(4326), *((lat, lon) if north else (lon, lat)))
+    assert told in doubt
+    assert not north or doubts_of_order(CRS.from_epsg(4326), lon, lat) == []
+
+
+def test_degrees_at_the_poles_are_refused():
+    with pytest.raises(InputError, match=r"a.laz: coordinates \(-33.0400, -68.8800\), taken .* with longitude first"):
+        check_place(CRS.from_epsg(4326), -33.04, -68.88, "a.laz")
+    check_place(CRS.from_epsg(4326), -68.88, -33.04, "a.laz")
+
+
+def test_the_order_of_degrees_is_told_of_a_cloud(tmp_path):
+    path = write_text(tmp_path / "a.xyz", np.array([[44.61, 7.92, 460], [44.611, 7.921, 461]]))
+    (remark,) = read_cloud(path, crs=CRS.from_epsg(4326)).remarks
+    assert "(44.6105, 7.9205) are taken for longitude and latitude" in remark

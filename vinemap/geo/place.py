@@ -34,6 +34,10 @@ SAME = 0.01
 """Metres within which two places are the same."""
 GLOBE = 6_371_000.0
 """Metres of its radius."""
+VINES = 25.0, 60.0
+"""Degrees of latitude between which most vines grow."""
+POLAR = 65.0
+"""Degrees of latitude beyond which none do."""
 UNSURE = "the accuracy of positions in WGS 84 is not known"
 GIVE = "give their CRS with --crs EPSG:n"
 """What to do with coordinates of a cloud that aren't of its CRS."""
@@ -86,6 +90,11 @@ def check_place(crs: CRS, x: float, y: float, of: str, *, remedy: str = GIVE) ->
     if _is_near_zero(flat, area, x, y):
         reason = f"they seem to be local metres: {remedy}{', or --crs local' if remedy == GIVE else ''}"
     elif _holds(area, *_lon_lat(flat, x, y)):
+        if _maybe_swapped(flat, x, y) and abs(y) > POLAR:
+            raise InputError(
+                f"{of}: coordinates ({x:.4f}, {y:.4f}), taken for longitude and latitude, lie where no vines grow: "
+                "export it with longitude first"
+            )
         return
     else:
         ways = {
@@ -112,6 +121,22 @@ def doubts_of(crs: CRS, x: float, y: float) -> list[str]:
         known = f"{own.name!r} has no place on the globe, and nothing is told in WGS 84: --crs EPSG:n gives it one"
         return [] if own == LOCAL else [known]
     return [*_roughness(flat, x, y), *_other_shift(own, flat, x, y)]
+
+
+def _maybe_swapped(flat: CRS, x: float, y: float) -> bool:
+    """Whether degrees lie where few vines grow, and would not if latitude came first."""
+    return flat.is_geographic and not VINES[0] <= abs(y) <= VINES[1] and VINES[0] <= abs(x) <= VINES[1]
+
+
+def doubts_of_order(crs: CRS, x: float, y: float) -> list[str]:
+    """Whether degrees of a cloud (x east) may be latitude and longitude: a sentence."""
+    if not _maybe_swapped(horizontal(crs), x, y):
+        return []
+    known = (
+        f"coordinates ({x:.4f}, {y:.4f}) are taken for longitude and latitude: if they are the other way round, export "
+        "the cloud with longitude first"
+    )
+    return [known]
 
 
 def doubts_of_heights(crs: CRS) -> list[str]:
