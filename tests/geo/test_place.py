@@ -14,7 +14,7 @@ from pyproj.transformer import AreaOfInterest, TransformerGroup
 from vinemap.cloud.las import read_cloud
 from vinemap.errors import GridError, InputError
 from vinemap.geo.crs import LOCAL, from_wgs84, horizontal, metric_crs, parse_crs, stated, to_wgs84, vertical_name
-from vinemap.geo.place import check_place, doubts_of, doubts_of_order
+from vinemap.geo.place import check_place, doubts_of, doubts_of_cloud
 
 FOOT = 0.3048
 SHIFT = "TOWGS84[590.5,69.5,411.6,-0.796,-0.052,-3.601,8.3]"
@@ -225,9 +225,9 @@ def test_degrees_with_latitude_first_are_told(lon, lat):
         "are taken for longitude and latitude: if they are the other way round, export the cloud with longitude first"
     )
     north = abs(lat) > 25
-    (doubt,) = doubts_of_order(CRS.from_epsg(4326), *((lat, lon) if north else (lon, lat)))
+    (doubt,) = doubts_of_cloud(CRS.from_epsg(4326), *((lat, lon) if north else (lon, lat)))
     assert told in doubt
-    assert not north or doubts_of_order(CRS.from_epsg(4326), lon, lat) == []
+    assert not north or doubts_of_cloud(CRS.from_epsg(4326), lon, lat) == []
 
 
 def test_degrees_at_the_poles_are_refused():
@@ -240,3 +240,23 @@ def test_the_order_of_degrees_is_told_of_a_cloud(tmp_path):
     path = write_text(tmp_path / "a.xyz", np.array([[44.61, 7.92, 460], [44.611, 7.921, 461]]))
     (remark,) = read_cloud(path, crs=CRS.from_epsg(4326)).remarks
     assert "(44.6105, 7.9205) are taken for longitude and latitude" in remark
+
+
+@pytest.mark.parametrize(
+    ("text", "foreign"),
+    [
+        ("EPSG:32632+5703", "NAVD88 height"),
+        ("EPSG:32632+6360", "NAVD88 height (ftUS)"),
+        ("EPSG:32632+5711", "AHD height"),
+        ("EPSG:32632+5773", ""),
+        ("EPSG:25832+5214", ""),
+        ("EPSG:4979", ""),
+    ],
+)
+def test_heights_above_another_countrys_datum_are_told(text, foreign):
+    crs = parse_crs(text)
+    said = [doubt for doubt in doubts_of_cloud(crs, *on(crs, 8.7, 46.2)) if "isn't used there" in doubt]
+    assert said == ([f"heights are said to be above {foreign}, which isn't used there: {MORE}"] if foreign else [])
+
+
+MORE = "--crs EPSG:n+m tells what they are above"

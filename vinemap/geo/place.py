@@ -128,8 +128,13 @@ def _maybe_swapped(flat: CRS, x: float, y: float) -> bool:
     return flat.is_geographic and not VINES[0] <= abs(y) <= VINES[1] and VINES[0] <= abs(x) <= VINES[1]
 
 
-def doubts_of_order(crs: CRS, x: float, y: float) -> list[str]:
-    """Whether degrees of a cloud (x east) may be latitude and longitude: a sentence."""
+def doubts_of_cloud(crs: CRS, x: float, y: float) -> list[str]:
+    """What is to be known of where a cloud is, by one of its points (x east): a sentence each."""
+    return [*_order(crs, x, y), *doubts_of(crs, x, y), *_datum(crs, x, y)]
+
+
+def _order(crs: CRS, x: float, y: float) -> list[str]:
+    """Whether degrees may be latitude and longitude."""
     if not _maybe_swapped(horizontal(crs), x, y):
         return []
     known = (
@@ -137,6 +142,15 @@ def doubts_of_order(crs: CRS, x: float, y: float) -> list[str]:
         "the cloud with longitude first"
     )
     return [known]
+
+
+def _datum(crs: CRS, x: float, y: float) -> list[str]:
+    """Whether heights are said to be above a datum that isn't used there, as in a CRS of another survey."""
+    up, flat = vertical(crs), horizontal(crs)
+    area = _area(up) if up and not is_local(flat) else None
+    if up is None or area is None or _holds(area, *_lon_lat(flat, x, y)):
+        return []
+    return [f"heights are said to be above {up.name}, which isn't used there: --crs EPSG:n+m tells what they are above"]
 
 
 def doubts_of_heights(crs: CRS) -> list[str]:

@@ -29,10 +29,9 @@ from vinemap.geo.place import (
     OTHER_PLACE,
     apart,
     check_place,
-    doubts_of,
+    doubts_of_cloud,
     doubts_of_given,
     doubts_of_heights,
-    doubts_of_order,
 )
 
 if TYPE_CHECKING:
@@ -253,7 +252,7 @@ def examined(xyz: Floats, header: Any, source: CRS, path: Path, *, given: bool =
     x, y = np.median(sample[:, :2], axis=0).tolist()
     check_place(source, x, y, str(path))
     check_steps(sample, len(xyz), header, source, path)
-    doubts = [*doubts_of_order(source, x, y), *doubts_of(source, x, y), *doubts_of_heights(source)]
+    doubts = [*doubts_of_cloud(source, x, y), *doubts_of_heights(source)]
     return [*_overridden(header, source, x, y, path), *doubts] if given else doubts
 
 

@@ -21,7 +21,7 @@ from vinemap.cloud.formats.told import Header, reading
 from vinemap.cloud.pdal.reader import read_pdal
 from vinemap.errors import EmptyError, InputError
 from vinemap.geo.crs import horizontal, vertical_unit
-from vinemap.geo.place import check_place, doubts_of, doubts_of_order
+from vinemap.geo.place import check_place, doubts_of_cloud
 from vinemap.geo.stated import crs_of, examined
 
 if TYPE_CHECKING:
@@ -116,4 +116,4 @@ def _checked(first: Floats, points: Points, header: Header, source: CRS, path: P
         return examined(first, header, source, path, given=given)
     x, y = np.median(first[:, :2], axis=0).tolist()
     check_place(source, x, y, str(path))
-    return [*doubts_of_order(source, x, y), *doubts_of(source, x, y)]
+    return doubts_of_cloud(source, x, y)
