@@ -1,5 +1,7 @@
 """Reading clouds: units, CRSs, clipping, and what can't be read."""
 
+import struct
+
 import laspy
 import numpy as np
 import pytest
@@ -329,3 +331,11 @@ def test_boundary_that_misses_the_cloud(tmp_path, points):
     path = write_las(tmp_path / "a.laz", points)
     with pytest.raises(InputError, match="no point lies inside the boundary"):
         read_cloud(path, boundary=(shapely.box(0, 0, 10, 10), UTM))
+
+
+def test_a_box_that_was_never_set(tmp_path, points):
+    path = write_las(tmp_path / "a.las", points)
+    data = bytearray(path.read_bytes())
+    data[179:227] = struct.pack("<6d", *[-1.7e308, 1.7e308] * 3)
+    path.write_bytes(data)
+    assert read_cloud(path).size == len(points)

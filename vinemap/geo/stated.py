@@ -293,8 +293,9 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> No
     metres = np.full(2, flat.axis_info[0].unit_conversion_factor)
     if flat.is_geographic:
         metres = DEGREE * np.array([np.cos(np.radians(np.median(sample[:, 1]))), 1.0])
-    whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(sample[:, :2], axis=0)
-    areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
+    with np.errstate(over="ignore"):  # of a box that was never set
+        whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(sample[:, :2], axis=0)
+        areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
     apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
     sizes = [*metres, vertical_unit(crs)]
     shown_steps = _shown_steps(sample, header.scales)
