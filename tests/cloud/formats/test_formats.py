@@ -165,13 +165,14 @@ NAMED = [
     ("No,lat,lon,h,E,N", "564"),
     ("z_dtm,Y_utm,X_utm,z", "324"),
     ("h,Altitude,North,East", "432"),
+    ("Y,X,Elev,", "213"),
 ]
 
 
 @pytest.mark.parametrize(("names", "order"), NAMED)
 def test_columns_are_told_by_the_likeliest_names(tmp_path, names, order):
     xyz = dict(zip(order, (414_700, 4_940_700, 469), strict=True))
-    values = [str(xyz.get(str(k + 1), 1)) for k in range(names.count(",") + 1)]
+    values = [str(xyz.get(str(k + 1), 1)) for k in range(len(names.strip(",").split(",")))]
     (tmp_path / "a.csv").write_text(f"{names}\n{','.join(values)}\n")
     (found,) = read_text(tmp_path / "a.csv").chunks
     assert found.tolist() == [[414_700, 4_940_700, 469]]
@@ -238,6 +239,8 @@ WRONG = [
     ("a.xyz", b"one two three\nfour five six\n", "no line of it begins with x, y and z"),
     ("a.csv", b"X,Y,Z_dsm,z_dtm\n1,2,3,4\n", "any of its columns Z_dsm, z_dtm may be z: rename what isn't"),
     ("a.csv", b"X,Y,Height_above_ground\n1,2,3\n", r"its names \(X, Y, Height_above_ground\) say x and y, but no z"),
+    ("a.csv", b"Y;X;Z;Class\n1;2;3\n", r"it has 4 names \(Y, X, Z, Class\), but 3 numbers a point: give each a name"),
+    ("a.asc", b"ncols 3\nnrows 1\n460 461 462\n", "is a raster as text: convert it to GeoTIFF, and give that"),
     ("a.xyz", bytes(100), "can't be read as text: it is packed"),
     ("a.xyz", b"414700 4940700 460\nbroken off here\n", r"can't be read as text \(could not convert"),
     ("a.tif", b"II*\0 no raster", "can't be read as GeoTIFF"),

@@ -20,7 +20,7 @@ BEGINNING = 65_536
 COMMENTS = ("#", "//", ";", "%")
 EASTS = (("x",), ("easting", "east", "e"), ("longitude", "lon", "long"))
 NORTHS = (("y",), ("northing", "north", "n"), ("latitude", "lat"))
-ELEVATIONS = ("z", "elevation", "altitude", "alt", "height", "h")
+ELEVATIONS = ("z", "elevation", "elev", "altitude", "alt", "height", "h")
 """What columns of x, y and z are called, the likeliest first; of the former two those of one kind go together."""
 ABOVE_GROUND = re.compile(r"h(eight)?[\W_]*above|[\W_]agl\b")
 """Names of heights that are no elevations."""
@@ -56,13 +56,15 @@ def read_text(path: Path) -> Points:
     Raises
     ------
     InputError
-        If it holds no points, no x, y and z can be told, or more than one column may be one of them.
+        If it holds no points, no x, y and z can be told, or more than one column may be one of them; if it is a raster.
     """
     with reading(path, "text"), path.open("rb") as stream:
         beginning = stream.read(BEGINNING)
         if b"\0" in beginning:
             raise InputError(f"{path}: can't be read as text: it is packed: which program wrote it, and as what?")
         lines = beginning.decode("utf-8-sig", "replace").splitlines()
+    if lines and lines[0].lower().startswith("ncols"):
+        raise InputError(f"{path}: is a raster as text: convert it to GeoTIFF, and give that")
     whole = len(beginning) < BEGINNING
     if form := _form(lines if whole else lines[:-1], path):
         return Points(Header(axis_units=form.units), _read(path, form))
@@ -77,16 +79,22 @@ def _form(lines: Sequence[str], path: Path) -> _Form | None:
     for skip, line in enumerate(lines):
         bare = line.strip().lstrip("#/;% ") if line.strip().startswith(COMMENTS) else line.strip()
         for sep in (";", "\t", ",", r"\s+"):
-            words = re.split(sep, _tight(bare) if sep == r"\s+" else bare)
+            words = [word.strip(" \"'") for word in re.split(sep, _tight(bare) if sep == r"\s+" else bare)]
+            while words and not words[-1]:  # as behind a separator at the end
+                words.pop()
             if len(words) < 3 or (sep == "," and re.fullmatch(r"[-+]?\d+,\d+(\s.*)?", bare)):
                 continue
-            cleaned = [word.strip(" \"'") for word in words]
-            if line.strip().startswith(COMMENTS) or not all(map(NUMBER.fullmatch, cleaned[:3])):
-                names = max(cleaned, names, key=lambda some: sum(map(bool, _axes(some))))
+            if line.strip().startswith(COMMENTS) or not all(map(NUMBER.fullmatch, words[:3])):
+                names = max(words, names, key=lambda some: sum(map(bool, _axes(some))))
                 continue
-            told = names if len(names) == len(cleaned) else []
+            told = names if len(names) == len(words) else []
+            if not told and (axes := _axes(names)) != tuple(sorted(axes)):
+                raise InputError(
+                    f"{path}: it has {len(names)} names ({', '.join(names)}), but {len(words)} numbers a point: give "
+                    "each a name"
+                )
             classes = next((k for k, name in enumerate(told) if is_class(name)), None)
-            decimal = "," if sep != "," and any("," in word for word in cleaned[:3]) else "."
+            decimal = "," if sep != "," and any("," in word for word in words[:3]) else "."
             columns = _columns(told, path)
             units = {axis: unit for axis, k in zip("xyz", columns, strict=True) if told and (unit := _unit(told[k]))}
             return _Form(skip, sep, decimal, columns, classes, units)
