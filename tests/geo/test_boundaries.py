@@ -222,12 +222,12 @@ def test_all_files_in_a_kmz_count(tmp_path):
 def test_a_layer_that_may_hold_polygons_is_not_passed_over(tmp_path, kind):
     """Beside one that does by its kind."""
     path = tmp_path / "b.gpkg"
-    tables = {"parcels": shapely.box(0, 0, 1, 1), "houses": shapely.box(2, 0, 3, 1)}
+    tables = {"fields": shapely.box(0, 0, 1, 1), "houses": shapely.box(2, 0, 3, 1)}
     for layer, square in tables.items():
         one = gpd.GeoDataFrame({"name": [layer]}, geometry=[shapely.GeometryCollection([square])], crs=32632)
-        one = one if layer == "parcels" else one.set_geometry([square], crs=32632)
-        one.to_file(path, layer=layer, geometry_type=kind if layer == "parcels" else None)
-    with pytest.raises(InputError, match=r"several layers of polygons \(houses, parcels\): save the parcels' alone"):
+        one = one if layer == "fields" else one.set_geometry([square], crs=32632)
+        one.to_file(path, layer=layer, geometry_type=kind if layer == "fields" else None)
+    with pytest.raises(InputError, match=r"several layers of polygons \(houses, fields\): save the parcels' alone"):
         read_boundary(path)
 
 

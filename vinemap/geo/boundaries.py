@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from vinemap.geo.layers import Layer
 
-PARCEL_LAYER = "parcel"
+PARCEL_LAYERS = ("parcel", "parcels")
+"""What the layer of polygons is called where there are several, in large letters or small."""
 AREAS, OTHERS = ("Polygon", "Surface"), ("Point", "LineString", "Curve", "None")
 """What kinds of layers are called that hold polygons, and that hold none; in the rest there may be some."""
 WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
@@ -79,7 +80,7 @@ def read_parcel(path: Path, *, parcel: str | None = None, lone: bool = False, lo
     Parameters
     ----------
     path : Path
-        File whose only layer of polygons, or whose layer ``parcel``, is read; of KML all layers are.
+        File whose only layer of polygons, or whose layer ``parcel`` or ``parcels``, is read; of KML all layers are.
     parcel : str, optional
         Name that one of the polygon's columns holds; without a name all polygons count. The column is that of
         :func:`read_parcels`, or the next one that holds the name.
@@ -294,7 +295,7 @@ def _is_measured(column: pd.Series) -> bool:
 
 
 def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
-    """The only layer of polygons of a file, or its layer ``parcel``; of KML all."""
+    """The only layer of polygons of a file, or its layer ``parcel`` or ``parcels``; of KML all."""
     if path.suffix.lower() in KML:
         return layers
     sure = [layer for layer in layers if any(word in layer.kind for word in AREAS)]
@@ -302,8 +303,8 @@ def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
     if len(sure) + len(open_) > 1:
         open_ = [layer for layer in open_ if any(map(polygons_of, layer.read().geometry))]
     found = sure + open_ or layers
-    named = [layer for layer in found if layer.name == PARCEL_LAYER]
-    if len(found) > 1 and not named:
+    named = [layer for layer in found if layer.name.lower() in PARCEL_LAYERS]
+    if len(found) > 1 and len(named) != 1:
         names = ", ".join(layer.name for layer in found)
         raise InputError(f"{path}: has several layers of polygons ({names}): save the parcels' alone")
     return named or found[:1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 import zipfile
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -52,10 +53,11 @@ def read_layer(source: str, name: str) -> gpd.GeoDataFrame:
     """What a layer of a file holds, of a Shapefile in the first encoding in which its words can be read."""
     import geopandas as gpd  # a quarter of a second of start-up, needed for people's files only
 
+    read = partial(gpd.read_file, source, layer=name, on_invalid="fix")  # as outlines that don't end where they begin
     for encoding in ENCODINGS if source.lower().endswith(".shp") else ():
         with suppress(UnicodeDecodeError):
-            return gpd.read_file(source, layer=name, encoding=encoding)
-    return gpd.read_file(source, layer=name)
+            return read(encoding=encoding)
+    return read()
 
 
 def read_layers(
