@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
+from vinemap.cloud.aside import placed
 from vinemap.cloud.copc import is_copc, points_about
 from vinemap.cloud.files import listed, worded
 from vinemap.cloud.formats.box import MOST_OUTSIDE, STRAYS, n_outside, stated_box
@@ -24,7 +25,7 @@ from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideEr
 from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name
 from vinemap.geo.place import Place
-from vinemap.geo.stated import crs_of, examined, to_place
+from vinemap.geo.stated import crs_of, examined
 from vinemap.geo.zones import deal, zones_of
 
 if TYPE_CHECKING:
@@ -138,8 +139,7 @@ def open_cloud(
         except InputError as error:
             raise InputError(f"{first.path}: {error}") from error
         place = Place(target, vertical_name(first.source), remarks)
-        metric = (to_place(*chunk, place, files[0]) for chunk in chain([first], chunks))
-        with ahead(metric) as prepared:
+        with ahead(placed(chain([first], chunks), place, files, remarks)) as prepared:
             yield place, prepared
 
 
