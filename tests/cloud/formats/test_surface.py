@@ -66,6 +66,16 @@ def test_what_zeros_are_is_decided_for_the_whole_raster(tmp_path, monkeypatch):
     assert np.unique(cloud.xyz[:, 2], return_counts=True)[1].tolist() == [3, 400]
 
 
+@pytest.mark.parametrize("filling", [-999, -99, 0, 9999])
+def test_what_fills_a_raster_up_without_saying_so_is_no_land(tmp_path, filling):
+    heights = np.full((40, 20), 400, np.float32)
+    heights[:20] = filling
+    heights[20:, :10] = np.linspace(380, 410, 200).reshape(20, 10)
+    assert read_cloud(write_raster(tmp_path / "a.tif", heights)).size == 400
+    heights[:20] = 375  # a lake
+    assert read_cloud(write_raster(tmp_path / "a.tif", heights)).size == 800
+
+
 def test_heights_in_whole_metres_are_told(tmp_path):
     heights = np.random.default_rng(0).uniform(400, 410, (40, 40))
     assert not [said for said in remarks_of(tmp_path, heights) if "steps" in said]

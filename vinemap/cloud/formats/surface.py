@@ -14,7 +14,7 @@ from vinemap.geo.place import doubts_of_heights
 from vinemap.geo.stated import crs_of, step_of
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Sequence
     from pathlib import Path
 
     from pyproj import CRS
@@ -25,10 +25,12 @@ if TYPE_CHECKING:
 
 LOWEST, HIGHEST = -1_000.0, 30_000.0
 """Metres or feet between which all land lies: what is beyond stands for nothing."""
-NEAR_ZERO = 10.0
-"""Metres or feet from 0 beyond which land lies where 0 stands for nothing, as rasters without nodata are filled up."""
+NEAR = 10.0
+"""Metres or feet from a height beyond which land lies where that stands for nothing, as 0 in rasters without nodata."""
 NEAREST = 0.01
 """Share of the land's pixels that may lie nearer, as those blended with the filling do."""
+MANY = 10
+"""Pixels of the lowest or the highest height, and other heights beside it, from which on it may stand for nothing."""
 LOOKED_AT = 32
 """Lines of a raster that tell both, evenly over it."""
 COARSE = 0.2
@@ -79,7 +81,7 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     step = step_of(some) * size * vertical_unit(source)
     coarse = f"{path.name} has heights in steps of {step:.2g} m, in which canopies hardly show: export it with decimals"
     remarks = remark, *([coarse] if step > COARSE else []), *(() if unit else doubts_of_heights(source))
-    chunks = _read(path, box_about(around, header, crs, path), size, zeros=_are_land(some))
+    chunks = _read(path, box_about(around, header, crs, path), size, blanks=_blanks(some))
     return Points(header, chunks, remarks, steps=False)
 
 
@@ -90,14 +92,25 @@ def _some_heights(raster: Any) -> Floats:
     return np.concatenate([heights[seen] for heights, seen in lines])
 
 
-def _are_land(some: Floats) -> bool:
-    """Whether zeros among the heights (n,) of a raster are land, and don't stand for nothing."""
-    land = np.abs(some[some != 0])
-    return bool(len(land)) and float(np.quantile(land, NEAREST)) <= NEAR_ZERO
+def _blanks(some: Floats) -> list[float]:
+    """Heights among some (n,) of a raster that stand for nothing: 0, the lowest or the highest, far from all others."""
+    land = some[some != 0]
+    blanks = [] if len(land) and _is_near(land, 0.0) else [0.0]
+    land = land if blanks else some
+    for end in (land.min(), land.max()) if len(land) else ():
+        others = land[land != end]
+        if len(land) - len(others) >= MANY <= len(np.unique(others)) and not _is_near(others, end):
+            blanks.append(float(end))
+    return blanks
 
 
-def _read(path: Path, box: Box, size: float, *, zeros: bool) -> Generator[Floats]:
-    """Points (n, 3) of what meets a box, chunk by chunk, those of height 0 among them or not.
+def _is_near(land: Floats, height: float) -> bool:
+    """Whether heights (n,) of land are about one that may stand for nothing."""
+    return bool(np.quantile(np.abs(land - height), NEAREST) <= NEAR)
+
+
+def _read(path: Path, box: Box, size: float, *, blanks: Sequence[float]) -> Generator[Floats]:
+    """Points (n, 3) of what meets a box, chunk by chunk, without heights that stand for nothing.
 
     ``size`` is that of the raster's unit in that of heights.
     """
@@ -109,7 +122,7 @@ def _read(path: Path, box: Box, size: float, *, zeros: bool) -> Generator[Floats
     for row in range(first, last, rows):
         with rasterio.open(path) as raster:  # anew, as GDAL keeps to the thread that opened it
             heights, seen = _heights(raster, row, min(rows, last - row), left, right - left)
-            i, j = np.nonzero(seen if zeros else seen & (heights != 0))
+            i, j = np.nonzero(seen & ~np.isin(heights, blanks))
             xyz = np.column_stack([_placed(raster, i + row + 0.5, j + left + 0.5), heights[i, j] * size])
         yield usable(xyz)
 
