@@ -6,7 +6,6 @@ from itertools import combinations, islice, product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import minimum_filter
 
 from vinemap.geo.stated import to_place
 
@@ -24,12 +23,14 @@ if TYPE_CHECKING:
 
 EVERY, MOST = 16.0, 60
 """Metres from one patch of ground to the next, and how many are looked at: the first that a file shows."""
-PAIRS = 100
+PAIRS = 40
 """Of files in patches that are compared, at the most."""
 COLUMN = 1 << 24
 """What numbers of patches differ by from one column to the next."""
 CELL, CELLS = 0.2, 60
 """Metres of a cell, and cells along a side of a patch."""
+DENSE = 4
+"""Points in a cell that are enough: of more, some are taken."""
 REACH = 7
 """Cells by which files may lie aside: half of the distance of most rows."""
 WINDOW = 15
@@ -56,7 +57,7 @@ def placed(
         if len(files) > 1:
             _add(tops, points, path)
         yield points
-    if (metres := aside(tops)) is not None:
+    if (metres := _aside(tops)) is not None:
         remarks.append(
             f"two flights lie about {metres:.1f} m aside of each other, and canopies come out too wide, or rows twice: "
             "align them, or take one"
@@ -65,6 +66,8 @@ def placed(
 
 def _add(tops: Tops, xyz: Floats, path: Path) -> None:
     """Note the highest of a file's points (n, 3) in each cell of the patches."""
+    cells = max(1.0, np.prod(np.ptp(xyz[:, :2], axis=0)) / CELL**2) if len(xyz) else 1.0
+    xyz = xyz[:: max(1, int(len(xyz) / cells / DENSE))]
     xyz = xyz[(np.mod(xyz[:, :2], EVERY) < CELL * CELLS).all(axis=1)]
     patch = np.floor(xyz[:, :2] / EVERY).astype(np.int64) @ [COLUMN, 1]
     for key in np.unique(patch).tolist():
@@ -75,7 +78,7 @@ def _add(tops: Tops, xyz: Floats, path: Path) -> None:
             np.maximum.at(top, (row, column), points[:, 2])
 
 
-def aside(tops: Tops) -> float | None:
+def _aside(tops: Tops) -> float | None:
     """Metres by which files lie aside of each other; None where they don't, or nothing tells it."""
     pairs = (pair for shown in tops.values() for pair in combinations(map(_heights, shown.values()), 2))
     found = np.array([metres for one, other in islice(pairs, PAIRS) if (metres := _between(one, other)) is not None])
@@ -85,6 +88,8 @@ def aside(tops: Tops) -> float | None:
 
 def _heights(top: Floats) -> tuple[Floats, Flags]:
     """Heights above the lowest points about, and which cells have one."""
+    from scipy.ndimage import minimum_filter  # only surveys of several files need it
+
     known = np.isfinite(top)
     ground = minimum_filter(np.where(known, top, np.inf), WINDOW)
     return np.where(known, np.minimum(top, ground + TALLEST) - np.where(known, ground, 0.0), 0.0), known
