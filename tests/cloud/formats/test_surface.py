@@ -12,7 +12,7 @@ from pyproj import CRS
 
 from vinemap.cloud.formats import surface
 from vinemap.cloud.las import read_cloud
-from vinemap.errors import InputError
+from vinemap.errors import EmptyError, InputError
 from vinemap.parcel import map_parcel
 
 UTM = CRS.from_epsg(32632)
@@ -74,6 +74,19 @@ def test_what_fills_a_raster_up_without_saying_so_is_no_land(tmp_path, filling):
     assert read_cloud(write_raster(tmp_path / "a.tif", heights)).size == 400
     heights[:20] = 375  # a lake
     assert read_cloud(write_raster(tmp_path / "a.tif", heights)).size == 800
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.001])
+def test_heights_in_small_units_that_are_not_stated_are_refused(tmp_path, unit):
+    heights = np.round(np.linspace(400, 410, 100) / unit).astype(np.int32).reshape(10, 10)
+    path = write_raster(tmp_path / "a.tif", heights)
+    with pytest.raises(InputError, match=rf"a\.tif: its heights are {400 / unit:.0f} and more: export them in metres"):
+        read_cloud(path)
+    with rasterio.open(path, "r+") as raster:
+        raster.scales = (unit,)
+    assert read_cloud(path).xyz[:, 2].min() == pytest.approx(400)
+    with pytest.raises(EmptyError):
+        read_cloud(write_raster(tmp_path / "a.tif", np.full((10, 10), 65_535, np.uint16)))
 
 
 def test_heights_in_whole_metres_are_told(tmp_path):

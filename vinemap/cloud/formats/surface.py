@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 LOWEST, HIGHEST = -1_000.0, 30_000.0
 """Metres or feet between which all land lies: what is beyond stands for nothing."""
+SMALLEST = 0.001
+"""Metres of the smallest unit in which heights may be stored as whole numbers."""
 NEAR = 10.0
 """Metres or feet from a height beyond which land lies where that stands for nothing, as 0 in rasters without nodata."""
 NEAREST = 0.01
@@ -49,7 +51,7 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     Raises
     ------
     InputError
-        If it is none, or is a photograph or a picture of one.
+        If it is none, is a photograph or a picture of one, or has heights as no land has.
     """
     import rasterio
     from rasterio.enums import ColorInterp
@@ -71,7 +73,7 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
             point_count=raster.width * raster.height,
         )
         unit = UNITS.get((raster.units[0] or "").strip().lower())
-        some = _some_heights(raster)
+        some = _some_heights(raster, path)
     remark = (
         f"{path.name} is a surface model, which shows canopies from above alone: their meshes reach down to the soil, "
         "where foliage begins isn't known (bottom_m, lwa_m2_ha), and volumes are of what was seen"
@@ -85,11 +87,17 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     return Points(header, chunks, remarks, steps=False)
 
 
-def _some_heights(raster: Any) -> Floats:
-    """Heights (n,) along some lines of a raster."""
+def _some_heights(raster: Any, path: Path) -> Floats:
+    """Heights (n,) along some lines of a raster, which mustn't all be beyond any land, though numbers of some unit."""
     rows = np.unique(np.linspace(0, raster.height - 1, LOOKED_AT).round().astype(int))
-    lines = (_heights(raster, row, 1, 0, raster.width) for row in rows.tolist())
-    return np.concatenate([heights[seen] for heights, seen in lines])
+    lines = [_heights(raster, row, 1, 0, raster.width) for row in rows.tolist()]
+    some = np.concatenate([heights[seen] for heights, seen in lines])
+    beyond = np.concatenate([heights[(heights >= HIGHEST) & (heights < HIGHEST / SMALLEST)] for heights, _ in lines])
+    if len(some) == 0 and len(np.unique(beyond)) > 1:
+        raise InputError(
+            f"{path}: its heights are {beyond.min():.0f} and more: export them in metres, or state their scale"
+        )
+    return some
 
 
 def _blanks(some: Floats) -> list[float]:
@@ -133,7 +141,8 @@ def _heights(raster: Any, row: int, rows: int, column: int, columns: int) -> tup
 
     window = Window(column, row, columns, rows)
     heights = raster.read(1, window=window).astype(float) * raster.scales[0] + raster.offsets[0]
-    return heights, (raster.read_masks(1, window=window) > 0) & (heights > LOWEST) & (heights < HIGHEST)
+    heights[raster.read_masks(1, window=window) == 0] = np.nan
+    return heights, (heights > LOWEST) & (heights < HIGHEST)
 
 
 def _placed(raster: Any, rows: Values, columns: Values) -> Floats:
