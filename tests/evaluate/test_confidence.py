@@ -27,8 +27,14 @@ def judged(
     houses=(),
     likelihood=0.7,
     plain=0.0,
+    noise=0.0,
+    leaves=0.0,
 ):
-    """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids."""
+    """Rows judged over ground on which canopies stand along them, and along other lines; nothing is seen in voids.
+
+    Heights are off by noise, and those of canopies by leaves, too: metres, standard deviations.
+    """
+    rng = np.random.default_rng(0)
     table = {"spacing_m": np.full(len(lines), SPACING), "support": support, "contrast": contrast}
     rows = gpd.GeoDataFrame(table, geometry=[shapely.LineString(line) for line in lines], crs=32632)
     wide, high = (
@@ -42,10 +48,11 @@ def judged(
         for line, w, h in zip([*lines, *standing], wide, high, strict=True):
             xs, ys = np.array(sorted(np.asarray(line).tolist())).T
             there = (np.abs(y[:, None] - np.interp(x, xs, ys)) <= w / 2) & (x >= xs[0]) & (x <= xs[-1])
-            values[there] = h if tall else 1.0
+            values[there] = h + rng.normal(0, leaves, np.count_nonzero(there)) if tall else 1.0
         hidden = shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(x, y))
         values[hidden] = np.nan if tall else 0.0
         values[shapely.contains_xy(shapely.union_all(list(houses)), *np.meshgrid(x, y))] = 5.0 if tall else 0.0
+        values += rng.normal(0, noise, grid.shape) * tall
         rasters.append(Raster(values, grid, rows.crs))
     grid = rasters[0].grid
     shown = ~shapely.contains_xy(shapely.union_all(list(voids)), *np.meshgrid(*grid.centres()))
@@ -98,6 +105,14 @@ def test_what_wanders_where_there_is_no_wave_of_rows_is_none():
     assert judged(block(1), likelihood=0.2)["confidence"].iloc[0] < 0.3
     assert judged(block(1), likelihood=0.1, plain=0.8)["confidence"].iloc[0] > 0.5
     assert judged(block(5), likelihood=0.4)["confidence"].min() > 0.9
+
+
+def test_what_is_as_even_as_the_ground_has_no_leaves():
+    """Tables of solar panels, or bales in a line; where noise hides leaves nothing tells them."""
+    assert judged(block(5), wide=1.2, noise=0.01)["confidence"].max() < 0.45
+    assert judged(block(5), wide=1.2, noise=0.01, leaves=0.04)["confidence"].min() > 0.9
+    assert judged(block(5), wide=0.5, noise=0.01)["confidence"].min() > 0.9  # its sides are steep
+    assert judged(block(5), wide=1.2, noise=0.06)["confidence"].min() > 0.9
 
 
 def test_a_row_that_stops_at_a_house_is_whole():

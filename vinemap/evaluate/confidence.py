@@ -25,6 +25,7 @@ EVIDENCE = {
     "length": 4.0,
     "wave": 4.0,
     "smooth": 4.0,
+    "rough": 4.0,
 }
 """Logarithm of the odds by which each ingredient, from 0 to 1, makes a row more sure."""
 DOUBT = 3.3 - sum(EVIDENCE.values())

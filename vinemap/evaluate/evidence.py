@@ -10,7 +10,8 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap.compute.beside import nearest_beside
-from vinemap.geo.raster import Raster, sample, sample_across
+from vinemap.geo.raster import Raster, cell_of, sample, sample_across
+from vinemap.surfaces.things import around_cells, roughness
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -57,6 +58,9 @@ BEND = 10.0
 """Metres over which rows bend alike."""
 CHORD = 2.0
 """Metres between which a row's turn is told."""
+NOISE, EVEN, COARSE, LEAFY = 0.1, 2.2, 0.02, 1.4
+"""Order of the ground's roughness that is only noise; how many times as rough, and metres, the top of a row is at the
+most that is none of leaves, as panels and bales are; and how many times as rough as that it is where leaves make it."""
 
 
 class _Stations(NamedTuple):
@@ -98,7 +102,7 @@ def evidence(
     go on, nor crosses where those beside it end; **alike**, that its canopy isn't far wider for its height than theirs;
     **claimed**, the share beside which no canopy stands where the next row ought to be; its **support**; its
     **contrast**; its **length** in spacings; the **wave** of rows thereabouts, which bushes in no order hardly have;
-    and that it is **smooth**.
+    that its course is **smooth**; and that its top is **rough**, as leaves are.
 
     Parameters are as of :func:`vinemap.evaluate.confidence.judge_rows`; there is a row at the least.
     """
@@ -126,6 +130,7 @@ def evidence(
             "length": 1 - np.exp(-shapely.length(lines) / (2 * usual)),
             "wave": _wave(at, field),
             "smooth": np.clip((CROOKED - _wandering(at)) / (CROOKED - SMOOTH), 0, 1),
+            "rough": _rough(at, chm, standing),
             "cut": _cut(at, usual, cover, seen, normal, np.where(standing, level[at.row], np.nan)),
         }
     )
@@ -297,6 +302,21 @@ def _wandering(at: _Stations) -> Values:
     off = turn - (total[high] - total[low]) / (high - low)
     out: Values = np.sqrt(np.bincount(row, off**2, rows) / np.maximum(n, 1))
     return out
+
+
+def _rough(at: _Stations, chm: Raster, standing: Flags) -> Values:
+    """How far tops of rows (n,), at stations with canopy, are rougher than noise makes the evenest ground."""
+    around, ground = around_cells(chm)
+    cells, tops = cell_of(at.xy[standing], chm.grid), np.zeros(chm.grid.shape, dtype=bool)
+    tops.ravel()[cells] = True
+    rough = roughness(around, tops | ground)
+    even = min(EVEN * float(np.quantile(rough[ground], NOISE)), COARSE) if ground.any() else 0.0
+    if even == 0:
+        return np.ones(len(at.start) - 1)
+    own = np.full(len(standing), np.nan)
+    own[standing] = rough.ravel()[cells]
+    out: Values = np.clip((at.median(own) / even - 1) / (LEAFY - 1), 0, 1)
+    return np.nan_to_num(out, nan=1.0)
 
 
 def _cut(at: _Stations, usual: Values, cover: Raster, seen: Seen, normal: Values, level: Values) -> Values:

@@ -51,17 +51,14 @@ def flat_things(chm: Raster, high: float) -> Flags:
     high : float
         Height in metres above which there are no vines.
     """
-    heights = np.nan_to_num(chm.values).astype(np.float32)
+    around, ground = around_cells(chm)
+    heights = around[:, :, 1, 1]
     out: Flags = np.zeros(heights.shape, dtype=bool)
     standing = heights >= LOWEST
     canopy = standing & (heights <= high)
     if not canopy.any():
         return out
-    around = sliding_window_view(np.pad(heights, 1), (3, 3))
-    ground = np.zeros_like(standing)
-    known = np.isfinite(chm.values[::EACH, ::EACH])
-    ground[::EACH, ::EACH] = known & (around[::EACH, ::EACH].max(axis=(2, 3)) < LOWEST / 2)
-    rough = _roughness(around, standing | ground)
+    rough = roughness(around, standing | ground)
     usual = AS_GROUND * np.median(rough[ground]) if ground.any() else np.inf
     even = standing & (rough <= min(EVEN * np.median(rough[canopy]), usual))
     even[even] = around[even].min(axis=(1, 2)) >= LOWEST
@@ -119,7 +116,16 @@ def _shape(of: Ints, size: Ints, y: Ints, x: Ints) -> tuple[Values, Values]:
     return np.sqrt(most / least), size / (4 * np.pi * np.sqrt(most * least))
 
 
-def _roughness(around: Values, where: Flags) -> Values:
+def around_cells(chm: Raster) -> tuple[Values, Flags]:
+    """Heights (ny, nx, 3, 3) of a height model's cells and those beside them, and some (ny, nx) that are ground."""
+    around = sliding_window_view(np.pad(np.nan_to_num(chm.values).astype(np.float32), 1), (3, 3))
+    ground = np.zeros(chm.grid.shape, dtype=bool)
+    known = np.isfinite(chm.values[::EACH, ::EACH])
+    ground[::EACH, ::EACH] = known & (around[::EACH, ::EACH].max(axis=(2, 3)) < LOWEST / 2)
+    return around, ground
+
+
+def roughness(around: Values, where: Flags) -> Values:
     """Root mean square in metres by which heights (ny, nx, 3, 3) lie off a plane, where asked for; 0 elsewhere."""
     i, j = np.mgrid[-1:2, -1:2]
     plane = np.column_stack([np.ones(9), i.ravel(), j.ravel()])
