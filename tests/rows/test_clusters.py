@@ -101,6 +101,18 @@ def test_small_clutter_is_dropped():
     assert set(found["truth"]) == {0}
 
 
+def test_a_last_vine_beyond_a_gap_is_of_its_row_where_those_beside_it_stand():
+    """Too few points for a piece of a row, which they are nowhere else: behind a headland, or too far away."""
+    rows = [np.array([[0, 2.5 * k], [30, 2.5 * k]]) for k in range(5)]
+    rows[2] = np.array([[0, 5.0], [25.6, 5.0]])
+    vine = np.array([[29.6, 5.1], [30.0, 5.1]])
+    own = cluster_rows(key_points([*rows, vine])).groupby("truth")["cluster"].unique()
+    assert own[5] == own[2]
+    for others, ended in ((30, 22.0), (25.6, 25.6)):
+        rows = [np.array([[0, 2.5 * k], [ended if k == 2 else others, 2.5 * k]]) for k in range(5)]
+        assert_rows_are_kept_apart(cluster_rows(key_points([*rows, vine])), 5)
+
+
 def test_no_key_points():
     found = cluster_rows(key_points([np.array([[0, 0], [5.0, 0]])]).iloc[:0])
     assert len(found) == 0

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
 
+FEW = 2
+"""Points of a piece that may be a row's last vine, but no row."""
 ALIGNED = 0.87
 """Cosine of the angle between two key points' rows up to which they may belong to one."""
 
@@ -60,7 +62,7 @@ def cluster_rows(
     along, across : float
         Semi-axes of the elliptic region of interest, in inter-row spacings.
     min_points : int
-        Points that a piece of a row has at the least.
+        Points that a piece of a row has at the least, but for a last vine beyond a gap at its end.
     max_gap : float
         Metres of missing vines that a row may bridge; 0 joins nothing.
     track_width : float
@@ -80,21 +82,24 @@ def cluster_rows(
     semi_axes = (np.sqrt(3 * spacing), np.sqrt(0.5 * spacing)) if thesis else (along * spacing, across * spacing)
     graph = ellipse_graph(xy, direction, along=semi_axes[0], across=semi_axes[1], mutual=not thesis)
     pieces = _components(graph)
-    kept = np.bincount(pieces, minlength=1)[pieces] >= min_points
-    out = key_points[kept].reset_index(drop=True)
-    if len(out) == 0:
-        return out.assign(cluster=np.empty(0, dtype=np.int64))
-    pieces = np.unique(pieces[kept], return_inverse=True)[1]
-    if thesis:
-        return out.assign(cluster=pieces)
-    position = _position_along(np.flatnonzero(kept), pieces, graph)
-    tree = cKDTree(xy[kept])
-    pieces, position = torn_at_kinks(tree, spacing[kept], pieces, position)
-    ends = ends_of(xy[kept], direction[kept], spacing[kept], pieces, position)
-    beside = partial(pieces_beside, tree, pieces=pieces, spacing=spacing[kept])
-    shown = {"cover": cover, "chm": chm}
-    rows = join(ends, candidates(ends, max_gap, beside), tree, track_width=track_width, high=high, **shown)
-    return out.assign(cluster=rows[pieces])
+    members = np.bincount(pieces, minlength=1)[pieces]
+    whole, few = np.flatnonzero(members >= min_points), np.flatnonzero((members < min_points) & (members >= FEW))
+    out = key_points.iloc[whole].reset_index(drop=True)
+    own = np.unique(pieces[whole], return_inverse=True)[1]
+    if thesis or len(whole) == 0:
+        return out.assign(cluster=own)
+    points = np.concatenate([whole, few])
+    xy, direction, spacing = xy[points], direction[points], spacing[points]
+    tree, n = cKDTree(xy[: len(whole)]), len(whole)
+    position = _position_along(points, np.unique(pieces[points], return_inverse=True)[1], graph)
+    own, position[:n] = torn_at_kinks(tree, spacing[:n], own, position[:n])
+    pieces = np.concatenate([own, own.max() + 1 + np.unique(pieces[few], return_inverse=True)[1]])
+    ends = ends_of(xy, direction, spacing, pieces, position)
+    beside = partial(pieces_beside, tree, pieces=own, spacing=spacing[:n])
+    pairs = candidates(ends, max_gap, beside, whole=int(own.max()) + 1)
+    rows = join(ends, pairs, tree, track_width=track_width, high=high, cover=cover, chm=chm)[pieces]
+    held = np.isin(rows, rows[:n])
+    return key_points.iloc[points[held]].reset_index(drop=True).assign(cluster=rows[held])
 
 
 def ellipse_graph(xy: Values, direction: Values, *, along: Values, across: Values, mutual: bool = False) -> csr_array:

@@ -23,6 +23,8 @@ THEREABOUTS, SEVERAL = 25.0, 5
 """Metres within which pieces, and so many of them, tell how rows bend."""
 STRAIGHT, BENT = 0.7, 0.4
 """Cosines of the angles by which two ends may look past each other, and may where rows beside them bend alike."""
+LAST = 6.0
+"""Metres without vines beyond which a single one is none of the row's."""
 OVERLAP = 0.5
 """Metres by which two pieces of a row may lie side by side at their ends."""
 
@@ -71,7 +73,7 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
     return out
 
 
-def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]]) -> Ints:
+def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]], *, whole: int) -> Ints:
     """Pairs of ends (k, 2) that may belong together, the best first.
 
     The lateral mismatch is that of the ends from the tangents of both (the mean of the two vanishes on an arc) or that
@@ -80,12 +82,17 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
 
     Where the rows beside it go on through the same bend, a gap may turn more than its row does before and after: then
     its ends' tangents meet within it. ``beside(pieces, middle, way, length)`` tells how many go on, and how many don't.
+
+    Pieces from the one numbered ``whole`` on are single vines: no row goes on in them, but one may end, up to ``LAST``
+    metres away, where it goes on in nothing else.
     """
     pairs = cKDTree(ends.xy).query_pairs(max_gap, output_type="ndarray")
-    pairs = pairs[pairs[:, 0] // 2 != pairs[:, 1] // 2]
-    a, b = pairs.T
-    gap = ends.xy[b] - ends.xy[a]
+    gap = ends.xy[pairs[:, 1]] - ends.xy[pairs[:, 0]]
     length = np.hypot(*gap.T)
+    single = np.count_nonzero(pairs // 2 >= whole, axis=1)
+    held = (pairs[:, 0] // 2 != pairs[:, 1] // 2) & ((single == 0) | (single == 1) & (length <= LAST))
+    pairs, gap, length, single = pairs[held], gap[held], length[held], single[held]
+    a, b = pairs.T
 
     def mismatch(at: Values, outward: Values) -> Values:
         way, turn = at[b] - at[a], outward[a] - outward[b]
@@ -109,7 +116,7 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
         through, ended = beside(pairs[k] // 2, middle, ends.tangent[a[k]] - ends.tangent[b[k]], length[k])
         fits[k] = through > 1 and ended <= 2 * through
     cost = length[fits] + 10 * lateral[fits]
-    out: Ints = pairs[fits][np.argsort(cost, kind="stable")]
+    out: Ints = pairs[fits][np.lexsort((cost, single[fits]))]
     return out
 
 
