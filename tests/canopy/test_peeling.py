@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from polygons import canopy, cross, one, shoelace
+from polygons import canopy, cross, shoelace
 from shapely import MultiPoint, Polygon
 
 from vinemap.canopy.hull import hull
-from vinemap.canopy.peeling import peel, peel_sections
+from vinemap.canopy.peeling import peel_sections
 
 
 def naive_hull(points, alive):
@@ -45,34 +45,39 @@ def naive_peel(points, count):
     return removed
 
 
+def outliers(points, count):
+    """Indices of so many outliers."""
+    return set(np.flatnonzero(~peel_sections(points, [0, len(points)], share=count / len(points)).kept).tolist())
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_peeling_removes_in_the_order_of_its_definition(seed):
     rng = np.random.default_rng(seed)
     points = (rng.normal(size=(60, 2)), rng.random((60, 2)), canopy(rng, 60)[0])[seed % 3]
-    assert peel(points, 25).tolist() == naive_peel(points, 25)
+    order = naive_peel(points, 25)
+    assert [outliers(points, k) for k in range(26)] == [set(order[:k]) for k in range(26)]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=18))
 def test_peeling_of_ties_duplicates_and_lines_follows_the_definition(cells):
     points = np.array(cells, dtype=float)
-    assert peel(points, 12).tolist() == naive_peel(points, 12)
-
-
-def test_peeling_stops_at_three_points():
-    assert len(peel(np.random.default_rng(0).random((20, 2)), 99)) == 17
-    assert len(peel(np.zeros((0, 2)), 1)) == len(hull(np.zeros((0, 2)))) == 0
+    order, counts = naive_peel(points, 12), range(min(13, len(points)))
+    assert [outliers(points, k) for k in counts] == [set(order[:k]) for k in counts]
 
 
 def test_count_of_outliers_is_the_share_rounded_up():
     points = np.random.default_rng(0).random((100, 2))
     for share, kept in ((0, 100), (0.02, 98), (0.021, 97), (0.07, 93), (0.999, 3)):
-        assert one(points, [[0.5, -1], [1, -1], [0, -1]], share=share).kept.sum() == kept
+        assert peel_sections(points, [0, 100], share=share).kept.sum() == kept
+    with pytest.raises(ValueError, match="share is 1"):
+        peel_sections(points, [0, 100], share=1)
 
 
 def test_hull_is_counter_clockwise_and_strict():
     square = [[0, 0], [2, 2], [1, 1], [2, 0], [0, 2], [1, 0], [0, 0]]
     assert hull(square).tolist() == [0, 3, 1, 4]
+    assert len(hull(np.zeros((0, 2)))) == 0
 
 
 def test_peeling_all_sections_is_peeling_each():
@@ -88,7 +93,7 @@ def test_peeling_all_sections_is_peeling_each():
             assert np.isnan(peeled.area[k])
             assert np.diff(peeled.start)[k] == 0
             continue
-        gone = finite[peel(points[finite], int(np.ceil(0.05 * len(finite))))]
+        gone = finite[list(outliers(points[finite], np.ceil(0.05 * len(finite))))]
         assert set(np.flatnonzero(~kept)) == set(gone) | set(np.flatnonzero(~np.isfinite(points).all(axis=1)))
         shape = MultiPoint(points[kept]).convex_hull
         assert peeled.area[k] == pytest.approx(shape.area)

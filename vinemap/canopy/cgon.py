@@ -27,29 +27,25 @@ LONGEST = 256
 
 
 class Enclosures(NamedTuple):
-    """The c-gons of m sections that hold n points."""
+    """The c-gons of m sections."""
 
     polygon: Floats
     """(m, c, 2) v1 … vc, counter-clockwise, m; NaN where not valid."""
     valid: Flags
     """(m,) False for fewer than 3 finite points or a non-finite fixed vertex."""
-    kept: Flags
-    """(n,) False for outliers and non-finite points."""
     hull_area: Floats
-    """(m,) area of the kept points' convex hull, m²."""
+    """(m,) area of the points' convex hull, m²."""
     area: Floats
     """(m,) area of the c-gon, m²."""
     shared_area: Floats
     """(m,) area that the c-gon and that hull share, m²."""
 
 
-def enclose(
-    points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7, share: float = 0.02, slide: bool = False
-) -> Enclosures:
-    """Peel every section's outliers and enclose the rest in the c-gon of minimum area whose v1, v2, vc are given.
+def enclose(points: ArrayLike, start: ArrayLike, feet: ArrayLike, *, c: int = 7, slide: bool = False) -> Enclosures:
+    """Enclose every section's points in the c-gon of minimum area whose v1, v2, vc are given.
 
-    The polygon leaves v2 and arrives at vc along the hull of (kept points, v2, vc), so all kept points are left of all
-    its edges but the two at v1; those cut points off where v1, v2, vc are not below them. v1 may be reflex.
+    The polygon leaves v2 and arrives at vc along the hull of (points, v2, vc), so all points are left of all its edges
+    but the two at v1; those cut points off where v1, v2, vc are not below them. v1 may be reflex.
 
     Where the fixed vertices don't fit the points they give way: feet in the wrong order are swapped, a foot inside the
     hull moves out sideways, at its height, to the hull (v2 to the right, vc to the left), and a v1 beyond the canopy
@@ -58,15 +54,13 @@ def enclose(
     Parameters
     ----------
     points : array_like of shape (n, 2)
-        (y, z) of all sections, section after section, m.
+        (y, z) of all sections, section after section, m; those that aren't finite don't count.
     start : array_like of shape (m + 1,)
         Section k holds ``points[start[k]:start[k + 1]]``.
     feet : array_like of shape (m, 3, 2)
         The fixed vertices v1 (bottom, middle), v2 (right foot) and vc (left foot).
     c : int
         Number of vertices, 5 or more (with 4 the polygon may have to be infinite).
-    share : float
-        Share of a section's points to peel, rounded up; at least 3 points stay.
     slide : bool
         Whether v2 and vc may slide along the hull's edge that holds v1, to where the area is least; where no edge
         does they stay.
@@ -74,22 +68,22 @@ def enclose(
     Raises
     ------
     ValueError
-        If c, share or start is out of bounds.
+        If c or start is out of bounds.
 
     Notes
     -----
-    Algorithm 1 and Eq. 12-19 of the thesis; the bilinear programme's optimum is found exactly, by choosing edges.
+    Eq. 12-19 of the thesis; the bilinear programme's optimum is found exactly, by choosing edges.
     """
     if c < 5:
         raise ValueError(f"c is {c}: a c-gon with three fixed vertices needs c >= 5")
-    peeled, fixed = peel_sections(points, start, share=share), as_complex(feet).reshape(-1, 3)
+    whole, fixed = peel_sections(points, start, share=0.0), as_complex(feet).reshape(-1, 3)
     m = len(fixed)
-    if len(peeled.area) != m:
-        raise ValueError(f"start must climb from 0 to {len(peeled.kept)} in {m + 1} numbers")
-    hulls, polygon = as_complex(peeled.hull), np.full((m, c), complex(math.nan, math.nan))
+    if len(whole.area) != m:
+        raise ValueError(f"start must climb from 0 to {len(whole.kept)} in {m + 1} numbers")
+    hulls, polygon = as_complex(whole.hull), np.full((m, c), complex(math.nan, math.nan))
     areas = np.full((3, m), math.nan)
-    in_threads(lambda part: _enclose_all(*part, hulls, peeled.start, fixed, slide, polygon, areas), stretches(m))
-    return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), peeled.kept, *areas)
+    in_threads(lambda part: _enclose_all(*part, hulls, whole.start, fixed, slide, polygon, areas), stretches(m))
+    return Enclosures(as_pairs(polygon), np.isfinite(areas[1]), *areas)
 
 
 @compiled

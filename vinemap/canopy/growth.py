@@ -46,7 +46,7 @@ def grow(points: ArrayLike, start: ArrayLike, feet: ArrayLike, reach: ArrayLike)
         The feet, moved down by the reach and outward by half of it.
     """
     section = as_complex(points)
-    offsets = checked_start(start, len(section), 0.0)
+    offsets = checked_start(start, len(section))
     fixed, out = as_complex(feet).reshape(-1, 3), np.asarray(reach, dtype=float)
     room = offsets + 2 * np.arange(len(offsets))
     outline, size = np.empty(2 * room[-1], dtype=np.complex128), np.zeros(len(fixed), dtype=np.int64)

@@ -18,11 +18,9 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Complex, Floats, Ints
 
 
-def checked_start(start: ArrayLike, n: int, share: float) -> Ints:
-    """Where each section's of n points begin (m + 1,); ValueError if they can't, or a share of points is none."""
+def checked_start(start: ArrayLike, n: int) -> Ints:
+    """Where each section's of n points begin (m + 1,); ValueError if they can't."""
     offsets = np.ascontiguousarray(start, dtype=np.int64)
-    if not 0 <= share < 1:
-        raise ValueError(f"share is {share}: give a share of the points in [0, 1)")
     if len(offsets) == 0 or offsets[0] != 0 or offsets[-1] != n or np.any(np.diff(offsets) < 0):
         raise ValueError(f"start must climb from 0 to {n}")
     return offsets

@@ -129,7 +129,7 @@ def _model_row(canopy: Canopy, *, c: int, share: float, on_foliage: bool, least:
     sections = sections.subset(peeled.kept)
     reach = foliage_reach(sections, peeled.area, peeled.perimeter, np.diff(peeled.start))
     outline, start, grown = grow(peeled.hull, peeled.start, feet, reach)
-    model = enclose(outline, start, grown if on_foliage else canopy.soil, c=c, share=0.0, slide=on_foliage)
+    model = enclose(outline, start, grown if on_foliage else canopy.soil, c=c, slide=on_foliage)
     # The foot that the sections around tell may leave a young vine nothing, and points on a line have no area.
     valid = model.valid & (model.hull_area > 0) & (np.diff(sections.start) >= least)
     if not valid.all():

@@ -33,7 +33,10 @@ class Peeled(NamedTuple):
 
 
 def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -> Peeled:
-    """Peel a share of every section's points, rounded up, off as outliers; at least 3 points stay (Algorithm 1).
+    """Peel a share of every section's points, rounded up, off as outliers (Algorithm 1).
+
+    Each is the hull vertex without which the hull's area shrinks most (ties: the first). At least 3 points stay, and
+    all those of a hull that has no area left.
 
     Parameters
     ----------
@@ -49,24 +52,15 @@ def peel_sections(points: ArrayLike, start: ArrayLike, *, share: float = 0.02) -
     ValueError
         If share or start is out of bounds.
     """
+    if not 0 <= share < 1:
+        raise ValueError(f"share is {share}: give a share of the points in [0, 1)")
     section = as_complex(points)
-    offsets = checked_start(start, len(section), share)
+    offsets = checked_start(start, len(section))
     m = len(offsets) - 1
     kept, area, perimeter = np.isfinite(section), np.full(m, math.nan), np.full(m, math.nan)
     hulls, size = np.empty(len(section), dtype=np.complex128), np.zeros(m, dtype=np.int64)
     in_threads(lambda part: _peel_all(*part, section, offsets, share, kept, area, perimeter, hulls, size), stretches(m))
     return Peeled(kept, area, perimeter, *packed(hulls, offsets[:-1], size))
-
-
-def peel(points: ArrayLike, count: int) -> Ints:
-    """Indices of up to ``count`` outliers among points (n, 2), in the order of their removal (Algorithm 1).
-
-    Each is the hull vertex without which the hull's area shrinks most (ties: the lowest index). Stops at 3 points, and
-    where the hull has no area left.
-    """
-    section = as_complex(points)
-    order = order_of(section)
-    return order[_peel(section[order], order, count)[0]] if len(section) else order
 
 
 @compiled

@@ -182,7 +182,7 @@ def polygons(cloud: str, boundary: str, c: int = 7) -> dict[str, str]:
     hulls, rings = ([ring for ring, kept in zip(r, some, strict=True) if kept] for r in (hulls, rings))
     start = np.concatenate([[0], np.cumsum([len(ring) for ring in hulls])])
     flat, feet = np.concatenate(hulls), feet[some]
-    mine, ours = best(lambda: enclose(flat, start, feet, c=c, share=0.0, slide=True))
+    mine, ours = best(lambda: enclose(flat, start, feet, c=c, slide=True))
     other, theirs = best(lambda: [cv2.approxPolyN(ring, c) for ring in rings])
     area = np.array([cv2.contourArea(ring) for ring in theirs])
     return {
