@@ -61,8 +61,8 @@ def warm() -> Warmth:
 
 
 @contextmanager
-def warming(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Callable[..., Any]]:
-    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits, at a stage, for what is compiled meanwhile.
+def warming(step: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Give a ``step`` for :func:`vinemap.parcel.map_parcel` that waits for what is compiled meanwhile before sections.
 
     Where something is kept already, all is taken to be.
     """
@@ -72,7 +72,7 @@ def warming(step: Callable[..., Any], *, until: str = "Sections") -> Iterator[Ca
     with _beside() as wait:
 
         def waiting(name: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-            if name == until:
+            if name == "Sections":
                 wait()
             return step(name, function, *args, **kwargs)
 

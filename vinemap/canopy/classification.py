@@ -16,18 +16,14 @@ if TYPE_CHECKING:
     from vinemap.cloud.points import PointCloud
 
 OTHER, GROUND, CANOPY, NOISE = 1, 2, 5, 7
-COMPANIONS = 3
-"""Points that lie near a point in the air, or it is noise."""
+AT_GROUND, ALOFT = 0.1, 0.5
+"""Metres above or below the terrain model: within the first points are ground, beyond the other they need company if
+they are no canopy, or are noise."""
+COMPANIONS, REACH = 3, 0.3
+"""How many other points are company, and within how many metres, or more in clouds of less than 100 points/m²."""
 
 
-def classify_points(
-    cloud: PointCloud,
-    leaves: Sequence[Sections],
-    *,
-    ground: float = 0.1,
-    air: float = 0.5,
-    reach: float = 0.3,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+def classify_points(cloud: PointCloud, leaves: Sequence[Sections]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """Classify the points of a cloud.
 
     Parameters
@@ -36,12 +32,6 @@ def classify_points(
         n points with their heights above ground, the whole cloud's or a part's.
     leaves : sequence of Sections
         Canopy points of the rows' sections.
-    ground : float
-        Metres above or below the terrain model within which points are ground.
-    air : float
-        Metres above or below it beyond which a point that is no canopy needs company, or it is noise.
-    reach : float
-        Metres within which ``COMPANIONS`` other points must lie; further in clouds of less than 100 points/m².
 
     Returns
     -------
@@ -58,13 +48,13 @@ def classify_points(
         row_id[mine[inside]] = np.repeat(sections.row_id, np.diff(sections.start))[inside]
     canopy = row_id > 0
     classes = np.full(cloud.size, OTHER, dtype=np.uint8)
-    classes[np.abs(heights) <= ground] = GROUND
-    aloft = np.flatnonzero(np.abs(heights) > air)
+    classes[np.abs(heights) <= AT_GROUND] = GROUND
+    aloft = np.flatnonzero(np.abs(heights) > ALOFT)
     lone = aloft[~canopy[aloft]]
     if len(lone):
         (west, south, _), (east, north, _) = cloud.extent
         density = cloud.size / max((east - west) * (north - south), 1.0)
-        near = reach * max(1.0, (100 / density) ** 0.5)
+        near = REACH * max(1.0, (100 / density) ** 0.5)
         distance, _ = cKDTree(cloud.xyz[aloft]).query(cloud.xyz[lone], COMPANIONS + 1, workers=-1)
         classes[lone[distance[:, -1] > near]] = NOISE
     classes[canopy] = CANOPY

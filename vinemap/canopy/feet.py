@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from vinemap.canopy.points import Sections
     from vinemap.compute.arrays import Flags, Ints, Values
 
+POOL = 5.0
+"""Metres along a row within which sections tell each other's foot."""
 FOOT_BIN, HIGHEST = 0.025, 3.0
 """Metres: bins of the histograms that tell the foliage's foot, and up to where they reach."""
 FOOT_RANKS = 0.02, 0.1
@@ -27,12 +29,12 @@ FOOT_BAND, FOOT_SPREAD = 0.15, 0.5
 where it ends."""
 
 
-def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]:
+def find_feet(canopy: Sections) -> tuple[Sections, Values]:
     """Find where the foliage of every section begins: the c-gon's fixed vertices v1, v2 and vc.
 
     The thesis sets them at soil level, where the polygon takes in the void under the canopy; here they lie at the
     foliage's foot: v1 under its middle, v2 and vc at its sides. A section's few points seldom show its foot, which
-    seen from the air lies in the shade: the points of all sections within ``pool`` metres along the row tell it.
+    seen from the air lies in the shade: the points of all sections within ``POOL`` along the row tell it.
 
     Returns
     -------
@@ -44,7 +46,7 @@ def find_feet(canopy: Sections, *, pool: float = 5.0) -> tuple[Sections, Values]
     m = len(canopy.row_id)
     if m == 0:
         return canopy, np.empty((0, 3, 2))
-    near = _window(canopy, pool)
+    near = _window(canopy, POOL)
     foot = _foot(canopy, near)
     canopy = canopy.subset(canopy.points[:, 1] >= np.repeat(foot, np.diff(canopy.start)))
     above = canopy.points[:, 1] <= np.repeat(foot + FOOT_BAND, np.diff(canopy.start))

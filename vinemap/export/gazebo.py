@@ -112,8 +112,8 @@ def _faces(meshes: list[Mesh]) -> bool:
     return any(len(mesh.faces) for mesh in meshes)
 
 
-def terrain_mesh(dtm: Path, origin: Origin | Corner, *, cell: float = TERRAIN_CELL) -> Mesh:
-    """A raster of elevations as a mesh in {Main}, facing up, a vertex every ``cell`` metres about.
+def terrain_mesh(dtm: Path, origin: Origin | Corner) -> Mesh:
+    """A raster of elevations as a mesh in {Main}, facing up.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def terrain_mesh(dtm: Path, origin: Origin | Corner, *, cell: float = TERRAIN_CE
 
     try:
         with rasterio.open(dtm) as source:
-            ny, nx = (max(2, round(n * source.res[0] / cell)) for n in source.shape)
+            ny, nx = (max(2, round(n * source.res[0] / TERRAIN_CELL)) for n in source.shape)
             z = source.read(1, out_shape=(ny, nx), masked=True, resampling=Resampling.average).filled(np.nan)
             crs, (west, south, east, north) = CRS(source.crs), source.bounds
     except RasterioIOError as error:

@@ -91,7 +91,7 @@ def place_canopies(field: Field, *, grid: bool = False) -> Placed:
     return Placed([replace(mesh, vertices=place(mesh.vertices)) for mesh in found.meshes], about)
 
 
-def write_ply(meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str] = ()) -> None:
+def write_ply(meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str]) -> None:
     """Write meshes as one binary PLY, little-endian: float32 positions and the ``row_id`` of every vertex.
 
     Parameters
@@ -126,7 +126,7 @@ def write_ply(meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str] = (
 
 
 def write_obj(
-    meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str] = (), material: tuple[str, str] | None = None
+    meshes: Sequence[Mesh], path: Path, *, comments: Sequence[str], material: tuple[str, str] | None = None
 ) -> None:
     """Write meshes as Wavefront OBJ, one object a row, named by its label; coordinates in tenths of a millimetre.
 

@@ -26,6 +26,8 @@ RESOLUTION = 0.4
 """Millimetres in a pixel of a ground."""
 RAY = 0.3
 """Millimetres of ground between two rays, at most; the high resolution's pixels have one ray each."""
+AMPLITUDE, PERIOD, STEP = 150.0, 3200.0, 61.0
+"""Millimetres: of the thesis's sine, and from pose to pose along it."""
 PIECE = 256
 """Pixels across each piece of a photograph that grounds are laid of."""
 
@@ -119,47 +121,36 @@ def render(ground: Ground, pose: Pose, *, camera: Camera = LOW, weather: Weather
     return out
 
 
-def sinusoid(
-    *, length_mm: float = 9600.0, amplitude_mm: float = 150.0, period_mm: float = 3200.0, step_mm: float = 61.0
-) -> list[Pose]:
+def sinusoid(*, length_mm: float = 9600.0) -> list[Pose]:
     """Poses of a robot that follows a sine from the left to the right, equally far apart along it."""
     x = np.linspace(0, length_mm, 20001)
-    wave = 2 * np.pi / period_mm
-    y = amplitude_mm * np.sin(wave * x)
+    wave = 2 * np.pi / PERIOD
+    y = AMPLITUDE * np.sin(wave * x)
     along = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.interp(np.arange(0, along[-1], step_mm), along, x)
-    headings = np.degrees(np.arctan(amplitude_mm * wave * np.cos(wave * at)))
-    return [Pose(*map(float, pose)) for pose in zip(at, amplitude_mm * np.sin(wave * at), headings, strict=True)]
+    at = np.interp(np.arange(0, along[-1], STEP), along, x)
+    headings = np.degrees(np.arctan(AMPLITUDE * wave * np.cos(wave * at)))
+    return [Pose(*map(float, pose)) for pose in zip(at, AMPLITUDE * np.sin(wave * at), headings, strict=True)]
 
 
-def straight(*, length_mm: float = 9600.0, step_mm: float = 61.0, heading_deg: float = 0.0) -> list[Pose]:
-    """Poses of a robot that drives straight on."""
+def above(place: Values, heading_deg: float) -> Pose:
+    """Pose of a robot whose camera, straight ahead of it as ``LOW`` and ``HIGH`` are, is above a place (2,)."""
     a = np.radians(heading_deg)
-    steps = np.arange(0, length_mm, step_mm)
-    return [Pose(float(s * np.cos(a)), float(s * np.sin(a)), heading_deg) for s in steps]
-
-
-def above(place: Values, heading_deg: float, *, camera: Camera = LOW) -> Pose:
-    """Pose of a robot whose camera, straight ahead of it, is above a place (2,)."""
-    a = np.radians(heading_deg)
-    x, y = place - camera.x_mm * np.array([np.cos(a), np.sin(a)])
+    x, y = place - LOW.x_mm * np.array([np.cos(a), np.sin(a)])
     return Pose(float(x), float(y), heading_deg)
 
 
-def wander(
-    n: int, *, step_mm: float = 70.0, turn_deg: float = 9.0, room_mm: float = 250.0, camera: Camera = LOW, seed: int = 0
-) -> list[Pose]:
-    """Poses of a robot whose camera moves at random by up to a step and turns, and stays about the origin."""
+def wander(n: int, *, seed: int = 0) -> list[Pose]:
+    """Poses of a robot whose camera moves at random by up to 70 mm and 9°, and stays within 250 mm of the origin."""
     rng = np.random.default_rng(seed)
     poses: list[Pose] = []
     place, heading = np.zeros(2), 0.0
     while len(poses) < n:
-        poses.append(above(place, heading, camera=camera))
-        heading += rng.uniform(-turn_deg, turn_deg)
+        poses.append(above(place, heading))
+        heading += rng.uniform(-9.0, 9.0)
         step = np.full(2, np.inf)
-        while np.abs(place + step).max() > room_mm:
+        while np.abs(place + step).max() > 250.0:
             away = rng.uniform(0, 2 * np.pi)
-            step = step_mm * np.sqrt(rng.uniform()) * np.array([np.cos(away), np.sin(away)])
+            step = 70.0 * np.sqrt(rng.uniform()) * np.array([np.cos(away), np.sin(away)])
         place = place + step
     return poses
 

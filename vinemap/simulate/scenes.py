@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 TABLE_2_1_ORIGIN = Origin(44.611669149, 7.924423195, 428.735)
 ROW_14_BEND = 0.6
 """How far row 14 keeps off its chord (m): row 15's start lies 0.9 m off that chord, and the rows 1.5 m apart."""
+SHORTEST = 6.0
+"""Metres of a row that fills a corner, at least."""
 FLIGHTS = {"2024-05": date(2024, 5, 14), "2025-06": date(2025, 6, 17), "2026-07": date(2026, 7, 7)}
 """Flights of the estate, and their days."""
 
@@ -77,33 +79,20 @@ def rows_of(
     return rows
 
 
-def rows_in(
-    outline: shapely.Polygon, *, spacing: float = 2.5, azimuth: float = 0.0, shortest: float = 6.0
-) -> list[Array]:
-    """Straight rows that fill a convex outline from edge to edge, as those of a block do that ends at tracks.
+def rows_in(outline: shapely.Polygon, *, spacing: float, azimuth: float) -> list[Array]:
+    """Straight rows (m, 2) that fill a convex outline from edge to edge, as those of a block do that ends at tracks.
 
-    Parameters
-    ----------
-    spacing, azimuth : float
-        As of :func:`rows_of`.
-    shortest : float
-        Metres below which a corner is left without a row.
-
-    Returns
-    -------
-    list of array (m, 2)
+    Spacing and azimuth are as of :func:`rows_of`. A corner in which a row would be shorter than ``SHORTEST`` has none.
     """
     x, y = outline.centroid.coords[0]
     reach = float(shapely.hausdorff_distance(outline.centroid, outline))
     n = 2 * int(reach / spacing) + 1
     lines = rows_of(n, length=2 * reach, spacing=spacing, azimuth=azimuth, centre=(x, y))
     inside = shapely.intersection([shapely.LineString(line) for line in lines], outline)
-    return [np.array(line.segmentize(0.25).coords) for line in inside if line.length >= shortest]
+    return [np.array(line.segmentize(0.25).coords) for line in inside if line.length >= SHORTEST]
 
 
-def barolo(
-    *, density: float = 380.0, density_outside: float = 60.0, seed: int = 1, table: Path = paths.TABLE_2_1
-) -> Survey:
+def barolo(*, density: float = 380.0, density_outside: float = 60.0) -> Survey:
     """Survey of three parcels in Barolo, EPSG:32632: Table 2.1's parcel F, a contour vineyard, two blocks.
 
     F's rows end where the thesis's do and keep its mean elevations; the rest of the hillside is made up.
@@ -112,10 +101,8 @@ def barolo(
     ----------
     density, density_outside : float
         Rays a square metre inside parcels and outside.
-    table : path
-        Table 2.1 as CSV.
     """
-    data = np.genfromtxt(table, delimiter=",", names=True)
+    data = np.genfromtxt(paths.TABLE_2_1, delimiter=",", names=True)
     crs = parse_crs("EPSG:32632")
     main = [np.column_stack([data[f"{axis}{end}"] for axis in "xyz"]) for end in ("1", "n_corrected")]
     e1, en = (from_wgs84(main_to_wgs84(end, TABLE_2_1_ORIGIN), crs) for end in main)
@@ -138,7 +125,7 @@ def barolo(
     apex = np.array([414865 - 50 * math.sin(math.radians(20)), 4940773 + 50 * math.cos(math.radians(20))])
     up = 474 + 0.25 * (50 - np.linalg.norm(contours - apex, axis=1)) + 0.03 * (contours[:, 0] - 414865)
     means += [(xy[None], float(z)) for xy, z in zip(contours, up, strict=True)]
-    terrain = surface_through(means, hillside(0.15, uphill=100, undulation=0.06, elevation=467, seed=seed))
+    terrain = surface_through(means, hillside(0.15, uphill=100, undulation=0.06, elevation=467, seed=1))
     return simulate(
         [
             Vineyard("F", rows, gaps=(2, 3, 3, 4, 5)),
@@ -153,7 +140,7 @@ def barolo(
             Obstacle(414784, 4940725, 2.2, 2.0, 5.2, bottom=1.4),
             Obstacle(414783, 4940750, 2.0, 1.6, 2.7, solid=True),
         ],
-        seed=seed,
+        seed=1,
     )
 
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 PLACE = (414750.0, 4940780.0)
 """Where scenes lie unless told otherwise: in Barolo, EPSG:32632."""
+CELL, MARGIN = 1.5, 50.0
+"""Metres: cells of the grid on which a surface through heights is held, and by which it is wider than these."""
 Array = NDArray[np.float64]
 Terrain = Callable[[Array, Array], Array]
 """Elevation (m) of the ground at x (east) and y (north)."""
@@ -59,9 +61,7 @@ def terraced(terrain: Terrain, rows: Sequence[Array], *, spacing: float = 2.5, r
     return surface
 
 
-def surface_through(
-    means: Sequence[tuple[Array, float]], base: Terrain, *, cell: float = 1.5, margin: float = 50.0
-) -> Terrain:
+def surface_through(means: Sequence[tuple[Array, float]], base: Terrain) -> Terrain:
     """Bend ``base`` as little as possible (thin plate) until its mean over each set of points is as given.
 
     Parameters
@@ -70,11 +70,9 @@ def surface_through(
         Points and the mean elevation over them (m); a single point fixes the surface there.
     base : callable
         Surface to start from.
-    cell, margin : float
-        The surface is held on a grid of this cell (m), wider than the points by ``margin`` (m) all round.
     """
     points = np.concatenate([xy for xy, _ in means])
-    origin, upper = points.min(axis=0) - margin, points.max(axis=0) + margin
+    origin, upper = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
     averaging = block_diag(*[np.full((1, len(xy)), 1 / len(xy)) for xy, _ in means])
 
     def kernel(a: Array) -> Array:
@@ -88,14 +86,14 @@ def surface_through(
     flat = averaging @ plane(points)
     system = np.block([[averaging @ kernel(points) @ averaging.T, flat], [flat.T, np.zeros((3, 3))]])
     weights = np.linalg.solve(system, np.concatenate([wanted, np.zeros(3)]))
-    nx, ny = np.ceil((upper - origin) / cell).astype(int) + 1
-    nodes = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2) * cell + origin
+    nx, ny = np.ceil((upper - origin) / CELL).astype(int) + 1
+    nodes = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2) * CELL + origin
     bend = [kernel(part) @ (averaging.T @ weights[:-3]) for part in np.array_split(nodes, len(nodes) // 1000 + 1)]
     grid = np.concatenate(bend) + plane(nodes) @ weights[-3:] + base(*nodes.T)
     spline = spline_filter(grid.reshape(nx, ny), order=3, mode="nearest")
 
     def surface(x: Array, y: Array) -> Array:
-        at = np.stack([(x - origin[0]) / cell, (y - origin[1]) / cell])
+        at = np.stack([(x - origin[0]) / CELL, (y - origin[1]) / CELL])
         return np.asarray(map_coordinates(spline, at, order=3, mode="nearest", prefilter=False))
 
     return surface

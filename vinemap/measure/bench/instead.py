@@ -45,7 +45,7 @@ ALTERNATIVES = [
 ]
 
 
-def instead(millions: float, family: str, run: Run, out: Path, *, limit: float = LIMIT) -> Lines:
+def instead(millions: float, family: str, run: Run, out: Path) -> Lines:
     """Table of what a user would pick instead of a step, on the survey of that size, beside ours in its run."""
     survey = ensure_survey(millions, out, family)
     lines = [["step", "instead", "takes", "gives", "ours takes", "ours gives"]]
@@ -60,7 +60,7 @@ def instead(millions: float, family: str, run: Run, out: Path, *, limit: float =
         given = {key: survey[key] for key in ("cloud", "boundary")}
         given |= {"millions": millions} if one.job == "ground" else {}
         given |= {"truth": survey["truth"], "thin": one.thin} if one.job == "rows" else {}
-        outcome = run_process(job(one.job, result, **given), limit=limit)
+        outcome = run_process(job(one.job, result, **given), limit=LIMIT)
         if outcome.code:
             lines.append([one.step, one.module, "–", outcome.said, ours, "–"])
             continue
