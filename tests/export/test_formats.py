@@ -146,7 +146,8 @@ def test_products_without_rows_or_lanes(tmp_path, product):
     with pytest.raises(InputError, match="two rows"):
         list(export_products([one], out, formats=["opennav_coverage"], lines="rows"))
     assert not out.exists()
-    list(export_products([one], out, formats=["isoxml"], lines="rows"))
+    (told,) = export_products([one], out, formats=["isoxml"], lines="rows")
+    assert told == f"{NAME}: 1 rows → {out / NAME} (isoxml)"
     list(export_products([one], out, formats=["nav2"], outer=True))
     assert sorted(path.name for path in (out / NAME).iterdir()) == ["isoxml", "nav2"]
 

@@ -98,9 +98,9 @@ def export_products(
             _write_whole(
                 target, partial(write, field, **options), _record(field, kind, {"lines": lines} | drawn | options)
             )
+        lanes = f", {len(field.lanes)} lanes" if wanted != "rows" else ""
         yield (
-            f"{field.parcel}: {len(field.rows)} rows, {len(field.lanes)} lanes → {naming.shown(target.parent)} "
-            f"({', '.join(of_parcels)})"
+            f"{field.parcel}: {len(field.rows)} rows{lanes} → {naming.shown(target.parent)} ({', '.join(of_parcels)})"
         )
     if tables:
         target = paths.table_folder(out)
