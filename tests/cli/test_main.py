@@ -4,15 +4,18 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import geopandas as gpd
 import laspy
 import numpy as np
 import pytest
 import shapely
+from click.testing import CliRunner
 from commands import assert_refused, vinemap
 from squares import write_cloud
 
+from vinemap.cli import doctor
 from vinemap.cli.track import track
 from vinemap.config.settings import OdometryOptions
 from vinemap.simulate.survey import write_survey
@@ -167,3 +170,13 @@ def test_what_a_template_is_a_share_of_is_told_as_in_the_settings():
     known = OdometryOptions.model_fields["template_share"]
     assert known.description in option.help.lower()
     assert option.default == known.default
+
+
+@pytest.mark.parametrize(
+    ("home", "shown"), [("a", "~/b (1.0"), ("a/b", "/a/b (1.0"), ("", "/a/b (1.0"), ("b", "/a/b (1.0")]
+)
+def test_the_doctor_calls_the_home_by_its_sign_and_nothing_else(monkeypatch, home, shown):
+    monkeypatch.setattr(Path, "home", lambda: Path("/", home))
+    monkeypatch.setattr(doctor, "_folders", lambda: [("working folder", "/a/b (1.0 GiB free)")])
+    monkeypatch.setattr(doctor, "_extras", list)
+    assert f" {shown} GiB free)" in CliRunner().invoke(doctor.doctor).output

@@ -27,6 +27,7 @@ def doctor() -> None:
     The exit code is 1 if something is missing that every map needs.
     """
     needed, whole = _needed()
+    home = re.compile(rf"(?<![^\s(:;]){re.escape(f'{Path.home()}{os.sep}')}")
     for heading, lines in (
         ("this machine", _machine()),
         ("what every map needs", needed),
@@ -35,7 +36,7 @@ def doctor() -> None:
     ):
         click.echo(f"{heading}:")
         for name, value in lines:
-            click.echo(f"  {name:<24} {value}".replace(str(Path.home()), "~"))
+            click.echo(f"  {name:<24} {home.sub(lambda _: f'~{os.sep}', value)}")
     if not whole:
         sys.exit(1)
 
