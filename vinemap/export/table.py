@@ -119,8 +119,8 @@ class Tables(NamedTuple):
         return f"table: {lines} ({kinds})"
 
 
-class _Product(NamedTuple):
-    """What is read of a product."""
+class _Flight(NamedTuple):
+    """What is read of a product, which shows a parcel on one date."""
 
     about: dict[str, Any]
     """``survey``, ``flown``, ``parcel``, and its ``key``."""
@@ -175,7 +175,7 @@ def _folder_and_record(product: Path) -> tuple[Path, tuple[Path, dict[str, Any]]
     return folder.resolve(), (folder, record)
 
 
-def _read(folder: Path, record: dict[str, Any]) -> _Product:
+def _read(folder: Path, record: dict[str, Any]) -> _Flight:
     parcel = record["parcel"]
     path = paths.geopackage(folder, parcel)
     rows, layers = read_layers(path, wanted=["vines"])
@@ -189,10 +189,10 @@ def _read(folder: Path, record: dict[str, Any]) -> _Product:
         "parcel": parcel,
         "key": str(record.get("key")),
     }
-    return _Product(about, None if is_local(rows.crs) else read_product(folder), rows, vines)
+    return _Flight(about, None if is_local(rows.crs) else read_product(folder), rows, vines)
 
 
-def _follow(flights: Sequence[_Product]) -> list[list[str]]:
+def _follow(flights: Sequence[_Flight]) -> list[list[str]]:
     """Names of the rows of each flight of a parcel, the latest first, the same where a row is."""
     names: dict[int, str] = {}
     found = []

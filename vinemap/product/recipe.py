@@ -293,8 +293,8 @@ def flown(cloud: Source) -> datetime:
         raise _unreadable(cloud.path, error) from error
 
 
-class Product(NamedTuple):
-    """A product that lies in a folder, by the record of its run."""
+class Recorded(NamedTuple):
+    """What the record of a run tells of a product, all of whose files are there."""
 
     key: str
     parcel: str
@@ -303,7 +303,7 @@ class Product(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def product_in(folder: Path) -> Product | None:
+def product_in(folder: Path) -> Recorded | None:
     """The product in a folder; None where there is none, or not all of its files, but for what is ``changed``."""
     try:
         record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
@@ -311,7 +311,7 @@ def product_in(folder: Path) -> Product | None:
         if others and not set(others) <= changed(folder).keys():
             return None
         known = record["key"], record["parcel"], record["counts"]["rows"], record["length_m"]
-        return Product(*known, tuple(record["warnings"]))
+        return Recorded(*known, tuple(record["warnings"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
