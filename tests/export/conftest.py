@@ -4,7 +4,7 @@ import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
-from exports import NAME
+from exported import NAME
 
 from vinemap.export import FORMATS
 from vinemap.export.lanes import lanes_between

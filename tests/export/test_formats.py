@@ -11,7 +11,7 @@ import pyogrio
 import pytest
 import shapely
 from commands import assert_refused, vinemap
-from exports import NAME, UTM, assert_same, coordinates, few, graph, in_grid
+from exported import NAME, UTM, assert_same, coordinates, few, graph, in_grid
 from products import tree
 
 from vinemap.errors import InputError, OutputError

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 import shapely
-from exports import NAME, UTM, assert_same, graph
+from exported import NAME, UTM, assert_same, graph
 from pyproj import Transformer
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components

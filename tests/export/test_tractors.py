@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import isoxml_writer
 import numpy as np
 import shapely
-from exports import NAME, assert_same, few, in_grid
+from exported import NAME, assert_same, few, in_grid
 from lxml import etree
 
 from vinemap.export.write import export_products
