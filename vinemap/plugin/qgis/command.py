@@ -50,7 +50,7 @@ def command() -> list[str]:
     found = ProcessingConfig.getSetting(SETTING) or written_in() or shutil.which("vinemap")
     if not found:
         raise QgsProcessingException(
-            "the command vinemap isn't found: install it (pip install vinemap), and name its command in "
+            "the command vinemap isn't found: install it, and name its command in "
             "Settings › Options › Processing › Providers › vinemap"
         )
     is_python = re.fullmatch(r"python[\d.]*w?", Path(found).name.lower().replace(".exe", ""))
