@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from sections import many_sections, one_section, separate
 
-from tests.sections import many_sections, one_section, separate
 from vinemap.canopy.points import canopy_size
 
 
