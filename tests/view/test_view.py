@@ -1,10 +1,13 @@
 """Products in Open3D: what is shown, the picture, and what is said where there is none."""
 
+import shutil
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 
+from vinemap import paths
 from vinemap.cli.main import commands
 from vinemap.compute import extras
 from vinemap.compute.extras import load
@@ -53,9 +56,13 @@ def test_a_picture(product, tmp_path):
 
 
 def test_what_cannot_be_shown_is_said_in_a_line(product, tmp_path, monkeypatch):
-    folder, _ = product
+    folder, cloud = product
     with pytest.raises(InputError, match="no product of vinemap: give its folder"):
         scene_of([tmp_path])
+    broken = shutil.copytree(folder, tmp_path / "A")
+    paths.raster(broken, "A", "dtm").unlink()
+    with pytest.raises(InputError, match=r"A_dtm\.tif: can't be read: map the parcel anew"):
+        scene_of([broken], cloud)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("sys.platform", "linux")

@@ -33,6 +33,8 @@ def write_agopengps(field: Field, folder: Path, *, lines: str) -> None:
 
     Raises
     ------
+    InputError
+        If coordinates are local.
     OSError
         If it can't be written.
     """

@@ -35,6 +35,8 @@ def write_isoxml(field: Field, folder: Path, *, lines: str) -> None:
 
     Raises
     ------
+    InputError
+        If coordinates are local.
     OSError
         If it can't be written.
     """

@@ -35,6 +35,8 @@ def write_geojson(field: Field, folder: Path) -> None:
 
     Raises
     ------
+    InputError
+        If coordinates are local.
     OSError or pyogrio.errors.DataSourceError
         If one can't be written.
     """
@@ -52,6 +54,8 @@ def write_shapefile(field: Field, folder: Path) -> None:
 
     Raises
     ------
+    InputError
+        If coordinates are local.
     OSError or pyogrio.errors.DataSourceError
         If one can't be written.
     """

@@ -61,7 +61,7 @@ def read_glb(path: Path) -> Canopies:
         crs, vertical = parse_crs(root.extras["crs"]), root.extras.get("vertical")
         meshes = [_read_row(document, node, origin) for node in nodes]
     except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror or error})") from error
+        raise InputError(f"{path}: can't be read ({error.strerror or error}): map the parcel again") from error
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, struct.error) as error:
         raise InputError(f"{path}: isn't a mesh of vinemap's: give the .glb of a product") from error
     return Canopies(meshes, crs, vertical, origin)

@@ -9,6 +9,7 @@ import pyogrio
 import rasterio
 import shapely
 from pyogrio.errors import DataLayerError, DataSourceError
+from rasterio.errors import RasterioIOError
 
 from vinemap import naming, paths
 from vinemap.cloud.las import read_cloud
@@ -106,9 +107,12 @@ def scene_of(products: Sequence[Path], cloud: Path | None = None, *, most: int =
 
 def _above(cloud: Cloud, terrain: Path, step: int) -> Floats:
     """One in so many points of a cloud, and their heights above the terrain, or 0: (n, 4)."""
-    with rasterio.open(terrain) as file:
-        elevation = file.read(1, masked=True).astype(float).filled(np.nan)
-        grid = file.transform
+    try:
+        with rasterio.open(terrain) as file:
+            elevation = file.read(1, masked=True).astype(float).filled(np.nan)
+            grid = file.transform
+    except RasterioIOError as error:
+        raise InputError(f"{naming.shown(terrain)}: can't be read: map the parcel anew") from error
     xyz = np.concatenate([np.empty((0, 3)), *(part.xyz[::step] for part in cloud.parts())])
     j = np.floor((xyz[:, 0] - grid.c) / grid.a).astype(int)
     i = np.floor((xyz[:, 1] - grid.f) / grid.e).astype(int)

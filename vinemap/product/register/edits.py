@@ -18,7 +18,7 @@ from vinemap.geo.lines import INSIDE, LAST_NUMBER
 from vinemap.product.register.file import DATES, HISTORY, REGISTER
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
     from pyproj import CRS
@@ -219,7 +219,7 @@ def number(rows: pd.DataFrame, past: pd.DataFrame) -> tuple[pd.DataFrame, list[s
     return rows, odd
 
 
-def _ways(usual: str) -> Any:
+def _ways(usual: str) -> Iterator[str]:
     yield usual
     yield from (f"{usual} ({n})" for n in count(2))
 
