@@ -90,7 +90,7 @@ def test_every_number_has_bounds():
 
 def test_bounds_and_choices_in_words():
     lines = {line.strip().partition(":")[0]: line for line in template("estate").splitlines() if "#" in line}
-    assert "  # seconds that a parcel may take (above 0 to 1e+06)" in lines["limit"]
+    assert "  # seconds that a parcel may take (above 0 to 1000000)" in lines["limit"]
     assert lines["engine"].endswith("(vinemap or pdal)") or lines["engine"].endswith("(processes or dask)")
     assert lines["workers"].strip().startswith("workers: null  # ")
     assert lines["surveys"].startswith("surveys: data/surveys  # ")

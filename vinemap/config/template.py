@@ -65,7 +65,7 @@ def _bounds(field: FieldInfo) -> str:
     """What a value may be, in words."""
     limits = {word: getattr(m, key) for m in field.metadata for key, word in LIMITS.items() if hasattr(m, key)}
     choices = [choice for kind in (field.annotation, *get_args(field.annotation)) for choice in _choices(kind)]
-    return " ".join(f"{word} {value:g}" for word, value in limits.items()) or " or ".join(choices)
+    return " ".join(f"{word} {value:.10g}" for word, value in limits.items()) or " or ".join(choices)
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
