@@ -75,8 +75,8 @@ def read_yaml(path: Path) -> Any:
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
         folder = path.parent if path.parent.is_dir() else Path()
         known = [str(p) for p in sorted(folder.glob("*.yaml"))]
-        hint = f": {nearest(str(path), known)}" if known else ""
-        raise ConfigError(f"{path}: no such file{hint}") from error
+        hint = nearest(str(path), known) if known else "vinemap config prints such files"
+        raise ConfigError(f"{path}: no such file: {hint}") from error
     except OSError as error:
         raise ConfigError(f"{path}: can't be read ({error.strerror})") from error
     except Exception as error:  # a YAMLError, or others of tags in odd places
