@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from vinemap.jobs.register import register_products
 from vinemap.jobs.survey import map_survey
 from vinemap.measure.tables import as_text
 from vinemap.parcel import map_parcel
+from vinemap.product.json_values import read_object
 from vinemap.simulate.plants import Vineyard
 from vinemap.simulate.scenes import rows_of
 from vinemap.simulate.survey import simulate, write_survey
@@ -109,7 +109,7 @@ def products_of(flight: Flight, folder: Path) -> gpd.GeoDataFrame:
         pairs = match_rows(rows.geometry.to_numpy(), np.array([flight.rows[row] for row in mine]), width=SAME)
         for j, i in pairs.tolist() if mine and len(rows) else ():
             true[j] = mine[i]
-        record = json.loads(paths.run_record(folder / flight.name / parcel).read_text())
+        record = read_object(paths.run_record(folder / flight.name / parcel))
         gone = rows["flags"].str.contains(BARE_FLAGS) | any(OTHERS in said for said in record["warnings"])
         found.append(rows[["label", "geometry"]].assign(parcel=parcel, true=true, gone=gone))
     table: gpd.GeoDataFrame = gpd.pd.concat(found, ignore_index=True)

@@ -8,7 +8,6 @@ https://docs.ogc.org/cs/22-025r4/22-025r4.html
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
@@ -19,6 +18,7 @@ from pyproj import CRS
 import vinemap
 from vinemap.geo.crs import is_local, to_wgs84, transformer
 from vinemap.geo.geoid import find_geoid
+from vinemap.product.json_values import read_object
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -128,10 +128,10 @@ def survey_tileset(tilesets: Sequence[Path]) -> dict[str, Any] | None:
     tiles = []
     for path in tilesets:
         try:
-            root = json.loads(path.read_text(encoding="utf-8"))["root"]
+            root = read_object(path)["root"]
             box = np.array(root["boundingVolume"]["box"], dtype=float).reshape(4, 3)
             matrix = np.array(root["transform"], dtype=float).reshape(4, 4).T
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             continue
         uri = f"{quote(path.parent.name)}/{quote(path.name)}"
         tiles.append(_Tile(np.vstack([_moved(box[:1], matrix), box[1:] @ matrix[:3, :3].T]), uri))

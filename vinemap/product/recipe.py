@@ -21,6 +21,7 @@ from vinemap.geo.boundaries import read_parcel
 from vinemap.geo.crs import is_local
 from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.zones import points_near
+from vinemap.product.json_values import read_object
 from vinemap.product.qgis.changed import changed
 
 if TYPE_CHECKING:
@@ -305,8 +306,8 @@ class Recorded(NamedTuple):
 
 def product_in(folder: Path) -> Recorded | None:
     """The product in a folder; None where there is none, or not all of its files, but for what is ``changed``."""
+    record = read_object(paths.run_record(folder))
     try:
-        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
         others = [name for name, size in record["files"].items() if (folder / name).stat().st_size != size]
         if others and not set(others) <= changed(folder).keys():
             return None
@@ -319,7 +320,7 @@ def product_in(folder: Path) -> Recorded | None:
 def made_of(folder: Path) -> dict[str, str]:
     """Names of the files that the product in a folder was made of, and their SHA-256; nothing where there is none."""
     try:
-        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-        return {str(one["file"]): str(one["sha256"]) for one in record["inputs"]}
-    except (OSError, ValueError, KeyError, TypeError):
+        inputs = read_object(paths.run_record(folder))["inputs"]
+        return {str(one["file"]): str(one["sha256"]) for one in inputs}
+    except (KeyError, TypeError):
         return {}

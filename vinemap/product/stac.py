@@ -27,6 +27,7 @@ from vinemap.cloud.files import CLOUDS
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.evaluate.unmapped import TALL
 from vinemap.geo.crs import WGS84, is_local, project
+from vinemap.product.json_values import read_object
 from vinemap.product.seasons.products import places_of
 from vinemap.product.store import write_whole
 
@@ -256,13 +257,13 @@ class _Parcel(NamedTuple):
 def _parcels(folder: Path, survey: str) -> Iterator[_Parcel]:
     for product in places_of(folder):
         path = paths.stac_item(product, product.name)
+        item = read_object(path)
         try:
-            item = json.loads(path.read_text(encoding="utf-8"))
             if item["collection"] != survey:
                 continue
             west, south, east, north = map(float, item["bbox"])
             flown = datetime.fromisoformat(item["properties"]["datetime"]).astimezone(UTC)
-        except (OSError, ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError):
             continue
         yield _Parcel(item["properties"]["title"], path, (west, south, east, north), flown)
 

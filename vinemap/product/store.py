@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import json
 import os
 import re
 import shutil
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING
 from vinemap import paths
 from vinemap.compute.locks import held
 from vinemap.errors import OutputError, VinemapError
+from vinemap.product.json_values import read_object
 from vinemap.product.qgis.changed import changed
 
 if TYPE_CHECKING:
@@ -245,21 +245,13 @@ def _publish(draft: Path, target: Path, *, replace: bool) -> None:
 
 def _is_earlier(target: Path, draft: Path) -> bool:
     """Whether a folder is empty or holds an earlier product of the same parcel."""
-    new = _record(draft)
-    return not any(target.iterdir()) or bool(new and new.get("parcel") == _record(target).get("parcel"))
-
-
-def _record(folder: Path) -> dict[str, object]:
-    try:
-        record = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return record if isinstance(record, dict) else {}
+    new, there = (read_object(paths.run_record(folder)) for folder in (draft, target))
+    return not any(target.iterdir()) or bool(new and new.get("parcel") == there.get("parcel"))
 
 
 def _recorded(target: Path) -> list[str]:
     """Files of a product, as its record has them."""
-    files = _record(target).get("files")
+    files = read_object(paths.run_record(target)).get("files")
     return [*map(str, files)] if isinstance(files, (list, dict)) else []
 
 

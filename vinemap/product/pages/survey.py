@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import warnings
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from vinemap import __version__, paths
 from vinemap.compute.threads import in_threads
 from vinemap.errors import VinemapError
 from vinemap.geo.crs import WGS84
+from vinemap.product.json_values import read_object
 from vinemap.product.pages.changes import TOLERANCE, outline_of, tell_parcel
 from vinemap.product.pages.page import as_json, page, page_hash, rings, unpacked
 from vinemap.product.pages.parcel import tell_seasons
@@ -107,11 +107,9 @@ def _kept(page: str, keys: Mapping[str, str]) -> dict[str, Any]:
 def _outcomes(folder: Path) -> dict[str, dict[str, Any]]:
     """What the last job says became of each parcel."""
     try:
-        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
-        return {
-            str(one["parcel"]): {"state": str(one["state"]), "reason": str(one["reason"])} for one in record["parcels"]
-        }
-    except (OSError, ValueError, KeyError, TypeError):
+        parcels = read_object(paths.survey_record(folder))["parcels"]
+        return {str(one["parcel"]): {"state": str(one["state"]), "reason": str(one["reason"])} for one in parcels}
+    except (KeyError, TypeError):
         return {}
 
 

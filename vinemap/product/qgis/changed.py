@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from contextlib import closing
 from datetime import UTC, datetime
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING
 from zipfile import BadZipFile, ZipFile
 
 from vinemap import paths
+from vinemap.product.json_values import read_object
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,7 +25,7 @@ def changed(folder: Path) -> dict[str, str]:
     aren't among them.
     """
     try:
-        files = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))["files"]
+        files = read_object(paths.run_record(folder))["files"]
         found = [folder / name for name, size in files.items() if _is_changed(folder / name, size)]
         times = [datetime.fromtimestamp(path.stat().st_mtime, UTC) for path in found]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):

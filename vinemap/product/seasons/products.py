@@ -15,6 +15,7 @@ from vinemap import naming, paths
 from vinemap.errors import InputError
 from vinemap.evaluate.changes import MEASURES
 from vinemap.geo.main import origin_of
+from vinemap.product.json_values import read_object
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -65,9 +66,9 @@ def read_products(folder: Path) -> Iterator[Product]:
 def places_of(folder: Path) -> list[Path]:
     """Folders of the products of a survey's parcels, without those that are gone, as by another name."""
     try:
-        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
+        record = read_object(paths.survey_record(folder))
         gone = {paths.parcel_folder(folder, str(one["parcel"])) for one in record["parcels"] if one["state"] == GONE}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (KeyError, TypeError):
         gone = set()
     try:
         return sorted(path.parent for path in folder.glob(f"*/{paths.RUN}") if path.parent not in gone)
@@ -100,11 +101,11 @@ def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
         If it is no whole product.
     """
     folder = product if product.is_dir() else product.parent
+    record = read_object(paths.run_record(folder))
     try:
-        record: dict[str, Any] = json.loads(paths.run_record(folder).read_text(encoding="utf-8"))
         record["parcel"] = str(record["parcel"])
         origin_of(record["origin"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{naming.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, "
             "or its GeoPackage"
@@ -117,19 +118,16 @@ def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
 
 def whose(place: Path) -> tuple[str, str] | None:
     """Parcel and survey of the product in a folder, as far as its record tells."""
-    try:
-        record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
-        return str(record["parcel"]), str(record["survey"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    record = read_object(paths.run_record(place))
+    return (str(record["parcel"]), str(record["survey"])) if {"parcel", "survey"} <= record.keys() else None
 
 
 def read_product(place: Path) -> Product | None:
     """The product in a folder; None if its records can't be read, or tell of no place and time."""
+    record = read_object(paths.run_record(place))
     try:
-        record = json.loads(paths.run_record(place).read_text(encoding="utf-8"))
         parcel = str(record["parcel"])
-        item = json.loads(paths.stac_item(place, parcel).read_text(encoding="utf-8"))
+        item = read_object(paths.stac_item(place, parcel))
         local = item["geometry"] is None
         outline = _local_outline(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
         linked = {
@@ -247,7 +245,7 @@ def _surveys_beside(folder: Path, latest: datetime) -> Iterator[Path]:
         try:
             if place == folder or not paths.survey_record(place).is_file():
                 continue
-            collection = json.loads(paths.stac_collection(place).read_text(encoding="utf-8"))
+            collection = read_object(paths.stac_collection(place))
             if datetime.fromisoformat(collection["extent"]["temporal"]["interval"][0][0]) < latest:
                 yield place
         except (OSError, ValueError, KeyError, TypeError, IndexError):
