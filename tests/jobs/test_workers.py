@@ -124,6 +124,15 @@ def test_a_call_that_takes_too_much_memory():
 
 
 @LINUX
+def test_text_takes_no_gigabyte_of_that_memory():
+    """As Arrow's own pool would, in which pandas keeps text where pyarrow is installed."""
+    pytest.importorskip("pyarrow")
+    data = "int(re.search(r'VmData:\\s+(\\d+) kB', open('/proc/self/status').read())[1])"
+    with Workers(1, memory=3 * 10**9) as one:
+        one.run(exec, f"import re, pyarrow; pyarrow.array(['a']); assert {data} < 500_000")
+
+
+@LINUX
 def test_the_system_takes_a_worker_first(worker):
     """Before the process that started it, if memory runs out."""
     assert worker.run(exec, "assert int(open('/proc/self/oom_score_adj').read()) == 900") is None

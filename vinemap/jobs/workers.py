@@ -289,6 +289,7 @@ def _limit(memory: int) -> None:
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("900", encoding="ascii")
     if memory:
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # its own sets a gigabyte aside, which counts
         with contextlib.suppress(ImportError, ValueError, OSError):  # not on Windows
             import resource
 
