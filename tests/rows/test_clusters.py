@@ -131,6 +131,21 @@ def test_rows_end_at_a_track_but_not_at_missing_vines(track):
     assert cluster_rows(points, track_width=50)["cluster"].nunique() == 5
 
 
+@pytest.mark.parametrize("aslant", [-0.5, 0.8])
+def test_rows_end_at_a_track_that_crosses_them_aslant(aslant):
+    """No more than 3 m of every row; what half of them lack on such a line is missing vines."""
+
+    def crossed(lacking):
+        ends = [(aslant * y + 1.5 * side, side) for y in 2.4 * (np.arange(8) - 4) for side in (-1, 1)]
+        rows = [np.array([[25.0 * side, 2.4 * (k // 2)], [x, 2.4 * (k // 2)]]) for k, (x, side) in enumerate(ends)]
+        return [np.vstack([rows[k], rows[k + 1][0]]) for k in range(0, 16, 2) if k % 4 >= lacking] + [
+            row for k, row in enumerate(rows) if k % 4 < lacking
+        ]
+
+    assert cluster_rows(key_points(crossed(4), spacing=2.4))["cluster"].nunique() == 16
+    assert cluster_rows(key_points(crossed(2), spacing=2.4))["cluster"].nunique() == 8
+
+
 def test_rows_do_not_reach_over_their_headland():
     """Rows that end together, and in line with one of them a hedge; a row that outlasts its neighbours goes on."""
     rows = [np.array([[0, 2.5 * k], [30, 2.5 * k]]) for k in range(5)]

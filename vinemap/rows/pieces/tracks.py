@@ -14,6 +14,8 @@ from vinemap.geo.raster import sample, sample_across
 from vinemap.rows.centre_line import runs_above
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
 
@@ -37,6 +39,8 @@ ASKEW = 3.0
 """Metres by which a track at 45° to rows must be wider than one straight across them."""
 SLANTS = np.concatenate([[0.0], np.arange(-1, 1.01, 0.1)])[:, None]
 """Tangents of the angle at which a track may cross rows."""
+ASLANT, SEVERAL = (-1.0, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1.0), 5
+"""Tangents of the angles at which gaps are looked for that lie side by side, and rows that must have one each."""
 OPEN = 0.62
 """Spacings from the nearest key point from which ground is open: half a one is the middle of an alley."""
 MARGIN = 0.5
@@ -73,29 +77,26 @@ def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:
 def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Flags:
     """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
-    Gaps of neighbouring rows that lie side by side are judged as one. What lies farther than half a track from all key
-    points is open ground. They are a track if it leads out of the field on both sides of them and through ``MOST`` of
-    its rows, and if no posts stand in it: missing vines of some neighbours may line up, those of all don't, but
-    something may stand on a track.
+    Gaps of neighbouring rows that lie side by side are judged as one, those on a line aslant, too. What lies farther
+    than half a track from all key points is open ground. They are a track if it leads out of the field on both sides of
+    them and through ``MOST`` of its rows, and if no posts stand in it: missing vines of some neighbours may line up,
+    those of all don't, but something may stand on a track.
     """
     wide = np.flatnonzero(gaps.length >= track_width)
     out = np.zeros(len(gaps.length), dtype=bool)
     if len(wide) == 0:
         return out
     gaps = Gaps(*(values[wide] for values in gaps))
-    one, other, common = _side_by_side(gaps)
-    covers = common >= COVERED * gaps.length[other]
-    linked = covers & (gaps.length[one] <= LONGER * gaps.length[other])
-    lanes = parts_of(len(wide), one[linked], other[linked])
 
-    def on_track(k: int) -> Ints:
-        lane = np.union1d(np.flatnonzero(lanes == k), one[covers & (lanes[other] == k)])
+    def on_track(lane: Ints) -> Ints:
         if not _leads_out(tree, gaps, lane, track_width):
             return lane[:0]
         posts = _with_posts(gaps, lane, cover) if cover is not None else 0
         return lane if posts < max(min(2, len(lane)), POSTED * len(lane)) else lane[:0]
 
-    out[wide[np.concatenate(in_threads(on_track, range(lanes.max() + 1)))]] = True
+    lanes = [*_lanes(gaps)]
+    lanes += [lane for aslant in ASLANT for lane in _lanes(gaps, aslant) if _in_line(gaps, lane, track_width)]
+    out[wide[np.concatenate(in_threads(on_track, lanes))]] = True
     return out
 
 
@@ -113,12 +114,34 @@ def blocked(gaps: Gaps, chm: Raster, *, high: float) -> Flags:
     return out
 
 
-def _side_by_side(gaps: Gaps) -> tuple[Ints, Ints, Values]:
+def _lanes(gaps: Gaps, aslant: float = 0.0) -> Iterator[Ints]:
+    """Gaps that lie side by side, straight across the rows or at an angle of such a tangent."""
+    one, other, common = _side_by_side(gaps, aslant)
+    covers = common >= COVERED * gaps.length[other]
+    linked = covers & (gaps.length[one] <= LONGER * gaps.length[other])
+    lanes = parts_of(len(gaps.length), one[linked], other[linked])
+    for k in range(lanes.max() + 1):
+        yield np.union1d(np.flatnonzero(lanes == k), one[covers & (lanes[other] == k)])
+
+
+def _in_line(gaps: Gaps, lane: Ints, track_width: float) -> bool:
+    """Whether gaps of several rows, and not far longer ones, have a track's width in common on one line across them."""
+    x, y = _in_frame(gaps, lane[0], lane)
+    if len(np.unique(np.rint(y))) < SEVERAL:
+        return False
+    off, half = x - np.polyval(np.polyfit(y, x, 1), y), gaps.length[lane] / 2
+    common = float((off + half).min() - (off - half).max())
+    return common >= max(track_width, float(half.max()))
+
+
+def _side_by_side(gaps: Gaps, aslant: float) -> tuple[Ints, Ints, Values]:
     """Gaps in rows beside each other, every pair in both orders, and how many metres they have in common."""
-    reach = np.hypot(NEXT * float(gaps.spacing.max()), float(gaps.length.max()) / 2)
+    across = NEXT * float(gaps.spacing.max())
+    reach = np.hypot(across, abs(aslant) * across + float(gaps.length.max()) / 2)
     pairs = cKDTree(gaps.middle).query_pairs(reach, output_type="ndarray")
     one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
     x, y = _in_frame(gaps, one, other)
+    x -= aslant * y * gaps.spacing[one]
     half, its = gaps.length[one] / 2, gaps.length[other] / 2
     common = np.minimum(half, x + its) - np.maximum(-half, x - its)
     parallel = np.abs((gaps.along[one] * gaps.along[other]).sum(axis=1)) > PARALLEL
