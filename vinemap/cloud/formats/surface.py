@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap.cloud.formats.box import box_about
-from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, usable
+from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, unit_of, usable
 from vinemap.errors import InputError
 from vinemap.geo.crs import vertical, vertical_unit
 from vinemap.geo.place import doubts_of_heights
@@ -37,12 +37,6 @@ LOOKED_AT = 32
 """Lines of a raster that tell both, evenly over it."""
 COARSE = 0.2
 """Metres of a step in heights from which on canopies are hardly more than one."""
-UNITS = {
-    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
-    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
-    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "foot_us"), 1200 / 3937),
-}
-"""Metres of the units in which a raster may state its values to be."""
 
 
 def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
@@ -72,7 +66,7 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
             np.append(corners.max(axis=0), np.nan),
             point_count=raster.width * raster.height,
         )
-        unit = UNITS.get((raster.units[0] or "").strip().lower())
+        unit = unit_of(raster.units[0] or "")
         some = _some_heights(raster, path)
     remark = (
         f"{path.name} is a surface model, which shows canopies from above alone: their meshes reach down to the soil, "

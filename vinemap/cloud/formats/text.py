@@ -6,7 +6,7 @@ import re
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from vinemap.cloud.formats.told import CHUNK, Header, Points, is_class, reading, usable
+from vinemap.cloud.formats.told import CHUNK, Header, Points, is_class, reading, unit_of, usable
 from vinemap.errors import EmptyError, InputError
 
 if TYPE_CHECKING:
@@ -24,16 +24,6 @@ ELEVATIONS = ("z", "elevation", "elev", "altitude", "alt", "height", "h")
 """What columns of x, y and z are called, the likeliest first; of the former two those of one kind go together."""
 ABOVE_GROUND = re.compile(r"h(eight)?[\W_]*above|[\W_]agl\b")
 """Names of heights that are no elevations."""
-UNITS = {
-    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
-    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
-    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
-    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
-    **dict.fromkeys(("usft", "ftus", "sft", "ussft"), 1200 / 3937),
-}
-"""Metres of units that names of columns may hold."""
-SURVEY = ("us", "survey")
-"""Words beside feet by which they are those of the US survey."""
 NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 
 
@@ -137,9 +127,7 @@ def _axes(names: Sequence[str]) -> tuple[list[int], list[int], list[int]]:
 
 def _unit(name: str) -> float | None:
     """Metres of the unit that stands behind a column's name, as in "Z [ft]", "height_m" and "Elevation (US ft)"."""
-    words = re.findall(r"[a-z]+", name.lower())[1:]
-    unit = next((UNITS[word] for word in words if word in UNITS), None)
-    return UNITS["usft"] if unit == UNITS["ft"] and any(word in SURVEY for word in words) else unit
+    return unit_of(re.sub(r"^[^a-z]*[a-z]+", "", name.lower()))
 
 
 def _called(words: Sequence[str], names: Sequence[str]) -> list[int]:

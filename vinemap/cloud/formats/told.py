@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +28,16 @@ NOISE = (7, 18)
 DECIMALS = 4
 """Of coordinates that were kept in single precision: about a point near by, where they are right to so many."""
 UNKNOWN = np.full(3, np.nan)
+UNITS = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+    **dict.fromkeys(("usft", "ftus", "sft", "ussft"), 1200 / 3937),
+}
+"""Metres of units, as people name them."""
+SURVEY = ("us", "survey")
+"""Words beside feet by which they are those of the US survey."""
 
 
 @dataclass(frozen=True)
@@ -183,3 +194,10 @@ def usable_records(records: Any) -> Floats:
     held = np.asarray(records.withheld, dtype=bool)
     classes = np.asarray(records.classification)
     return usable(xyz[~held], classes[~held]) if held.any() else usable(xyz, classes)
+
+
+def unit_of(said: str) -> float | None:
+    """Metres of the unit that is among some words, as in "US survey feet" or "foot_us"; None if there is none."""
+    words = re.findall(r"[a-z]+", said.lower())
+    unit = next((UNITS[word] for word in words if word in UNITS), None)
+    return UNITS["usft"] if unit == UNITS["ft"] and any(word in SURVEY for word in words) else unit
