@@ -126,7 +126,7 @@ def test_a_call_that_takes_too_much_memory():
 @LINUX
 def test_text_takes_no_gigabyte_of_that_memory():
     """As Arrow's own pool would, in which pandas keeps text where pyarrow is installed."""
-    pytest.importorskip("pyarrow")
+    pytest.importorskip("pyarrow", reason="needs pyarrow, in which pandas keeps text")
     data = "int(re.search(r'VmData:\\s+(\\d+) kB', open('/proc/self/status').read())[1])"
     with Workers(1, memory=3 * 10**9) as one:
         one.run(exec, f"import re, pyarrow; pyarrow.array(['a']); assert {data} < 500_000")
