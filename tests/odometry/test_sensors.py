@@ -190,7 +190,7 @@ def test_a_fix_far_off_is_left_out():
     assert pulled(track, Fixes(np.array([0.0, 900.0]), xy[:2], np.full(2, 20.0))).left_out == 1
 
 
-def test_places_are_in_the_frame_of_the_start(tmp_path):
+def test_places_are_in_the_frame_of_the_start_and_accuracies_are_horizontal(tmp_path):
     lon, lat, _ = Geod(ellps="WGS84").fwd(START.lon, START.lat, START.heading_deg, 10.0)
     path = tmp_path / "fixes.csv"
     path.write_text(f"time;lat;lon;accuracy_m\n2026-05-14T08:00:00Z;{lat!r};{lon!r};0.02\nbad;1;2;3\n")
@@ -198,7 +198,7 @@ def test_places_are_in_the_frame_of_the_start(tmp_path):
     assert left_out == 1
     assert fixes.xy == pytest.approx(np.array([[10_000.0, 0.0]]), abs=1)
     assert fixes.times == pytest.approx([1778745600])
-    assert fixes.sd == pytest.approx([20.0])
+    assert np.hypot(fixes.sd, fixes.sd) == pytest.approx([20.0])
 
 
 def test_lines_that_jump_are_left_out(tmp_path):

@@ -33,7 +33,7 @@ SCALE, SLIP = 0.05, 0.02
 DRIFT, JITTER = 0.5, 0.2
 """The same of yaw rates in °/s."""
 ACCURACY = 20.0
-"""Standard deviation of satellite fixes in mm."""
+"""Of satellite fixes in mm, in the horizontal: the root of the mean square of their distances (DRMS)."""
 
 
 class Bridge(NamedTuple):
@@ -61,8 +61,9 @@ def bridges(
         lost = lost_frames(len(poses), rng)
         frames = [Frame(str(i), float(times[i]), None if lost[i] else image) for i, image in enumerate(seen)]
         odometer = Odometer(wheels_of(true, rng))
-        ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, ACCURACY, (2, 2))
-        fixes = Fixes(times[[0, -1]], ends, np.full(2, ACCURACY))
+        sd = np.full(2, ACCURACY / np.sqrt(2))
+        ends = np.array([true[0][:2], true[-1][:2]]) + rng.normal(0, sd, (2, 2))
+        fixes = Fixes(times[[0, -1]], ends, sd)
         alone, driven = (list(follow(iter(frames), camera=LOW, sensor=sensor)) for sensor in (None, odometer))
         tracks = {
             "the last movement": alone,

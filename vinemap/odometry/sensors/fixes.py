@@ -21,7 +21,7 @@ PLACES = ("lat", "lon", "accuracy_m")
 
 
 class Fixes(NamedTuple):
-    """Where a robot's centre was at times, in mm in its frame at the start, (n, 2), and standard deviations (n,)."""
+    """Where a robot was: times (n,), places (n, 2) in mm in its frame at the start, sd along each axis (n,)."""
 
     times: Values
     xy: Values
@@ -30,6 +30,9 @@ class Fixes(NamedTuple):
 
 def read_fixes(path: Path, start: Start) -> tuple[Fixes, int]:
     """Read satellite fixes from a CSV, and tell how many lines were left out.
+
+    Accuracies are horizontal, as receivers state them: the root of the mean square of distances from the true place
+    (DRMS), √2 times the standard deviation along an axis where both axes have the same.
 
     Raises
     ------
@@ -48,4 +51,4 @@ def read_fixes(path: Path, start: Start) -> tuple[Fixes, int]:
     east, north, _ = wgs84_to_main(degrees, Origin(start.lat, start.lon, 0.0)).T
     a = np.radians(start.heading_deg)
     xy = 1000 * np.column_stack([east * np.sin(a) + north * np.cos(a), north * np.sin(a) - east * np.cos(a)])
-    return Fixes(times[kept], xy, 1000 * accuracy[kept]), int(len(times) - kept.sum())
+    return Fixes(times[kept], xy, 1000 * accuracy[kept] / np.sqrt(2)), int(len(times) - kept.sum())
