@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from vinemap.config.drives import Start
     from vinemap.odometry.frames import Frame
     from vinemap.odometry.refinement import Method
+    from vinemap.odometry.sensors.fixes import Fixes
     from vinemap.odometry.sensors.wheels import Wheels
 
 STAGES = ("Following the robot", "Placing its track", "Writing")
@@ -126,13 +128,8 @@ def map_drive(
     _check_out(out, rows)
     if rows and not start:
         raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
-    if fixes and not start:
-        raise InputError(f"{fixes}: fixes need a start: give --start lat,lon,heading, roughly")
     lines = _rows_of(rows) if rows else None
-    wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
-    known, odd_fixes = read_fixes(fixes, start) if fixes and start else (None, 0)
-    crs = _crs_of(start, lines)
-    odometer = Odometer(wheels) if wheels else None
+    sensors = _read_sensors(motion, fixes, start)
     source = read_recording(recording, camera=camera)
 
     def followed() -> list[TrackPoint]:
@@ -144,35 +141,16 @@ def map_drive(
             angles=angles,
             method=method,
             foresight=MEMORY,
-            sensor=odometer,
+            sensor=sensors.odometer,
         )
         return list(told)
 
-    def placed(track: list[TrackPoint]) -> dict[str, gpd.GeoDataFrame]:
-        layers = track_layers(track, start=start, crs=crs)
-        if lines is None:
-            return layers
-        return layers | {"poses": beside_rows(layers["poses"], lines)}
-
-    if lines is not None:
-        placed(
-            [TrackPoint("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)]
-        )  # whether start and rows go together
+    placed = partial(_placed, start=start, rows=lines)
+    if lines is not None:  # whether start and rows go together
+        placed([TrackPoint("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)])
     track = step(STAGES[0], followed)
     _check_track(track, recording, camera)
-    remarks = []
-    if motion and wheels:
-        check_times(motion, wheels.times, track)
-        remarks += [f"{odd_wheels} lines of {motion} left out"] * (odd_wheels > 0) + _against_wheels(
-            motion, wheels, track
-        )
-    if fixes and known:
-        check_times(fixes, known.times, track)
-        track, far, fit = step(STAGES[1], joined, track, known, odometer)
-        remarks += [f"{odd_fixes + far} of {odd_fixes + len(known.sd)} fixes left out"] * (odd_fixes + far > 0)
-        remarks += ["fixes contradict the track by more than both err"] * (not fit)
-    else:
-        track = step(STAGES[1], bridged, track, odometer)
+    track, remarks = step(STAGES[1], _held_against, sensors, track)
     layers = step(STAGES[1], placed, track)
     step(STAGES[2], _write, layers, out)
     flags = [point.flag for point in track if point.flag]
@@ -183,9 +161,54 @@ def map_drive(
         flags={flag: flags.count(flag) for flag in set(flags)},
         length_m=float(layers["track"]["length_m"].sum()),
         n_stretches=len(layers["track"]),
-        remarks=tuple(remarks),
+        remarks=remarks,
         sunk=max((1 - point.height_mm / camera.above_ground_mm for point in track), key=abs),
     )
+
+
+class _Sensors(NamedTuple):
+    """What goes with a camera: wheels, satellite fixes, their files, and how many lines of these were left out."""
+
+    motion: Path | None
+    wheels: Wheels | None
+    odd_wheels: int
+    fixes: Path | None
+    known: Fixes | None
+    odd_fixes: int
+    odometer: Odometer | None
+
+
+def _read_sensors(motion: Path | None, fixes: Path | None, start: Start | None) -> _Sensors:
+    if fixes and not start:
+        raise InputError(f"{fixes}: fixes need a start: give --start lat,lon,heading, roughly")
+    wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
+    known, odd_fixes = read_fixes(fixes, start) if fixes and start else (None, 0)
+    return _Sensors(motion, wheels, odd_wheels, fixes, known, odd_fixes, Odometer(wheels) if wheels else None)
+
+
+def _held_against(sensors: _Sensors, track: list[TrackPoint]) -> tuple[list[TrackPoint], tuple[str, ...]]:
+    """A track whose gaps are crossed and which is pulled to fixes, and what is to be said of the sensors."""
+    motion, wheels, odd_wheels, fixes, known, odd_fixes, odometer = sensors
+    remarks: list[str] = []
+    if motion and wheels:
+        check_times(motion, wheels.times, track)
+        remarks += [f"{odd_wheels} lines of {motion} left out"] * (odd_wheels > 0)
+        remarks += _against_wheels(motion, wheels, track)
+    if not (fixes and known):
+        return bridged(track, odometer), tuple(remarks)
+    check_times(fixes, known.times, track)
+    track, far, fit = joined(track, known, odometer)
+    remarks += [f"{odd_fixes + far} of {odd_fixes + len(known.sd)} fixes left out"] * (odd_fixes + far > 0)
+    remarks += ["fixes contradict the track by more than both err"] * (not fit)
+    return track, tuple(remarks)
+
+
+def _placed(
+    track: Sequence[TrackPoint], *, start: Start | None, rows: gpd.GeoDataFrame | None
+) -> dict[str, gpd.GeoDataFrame]:
+    """A track's layers on the map."""
+    layers = track_layers(track, start=start, crs=_crs_of(start, rows))
+    return layers if rows is None else layers | {"poses": beside_rows(layers["poses"], rows)}
 
 
 def _against_wheels(path: Path, wheels: Wheels, track: Sequence[TrackPoint]) -> list[str]:
