@@ -8,6 +8,7 @@ notebooks, scripts without a main guard and Dask's daemonic workers can start so
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import pickle
 import queue
@@ -254,6 +255,7 @@ def serve(cores: int, memory: int) -> NoReturn:
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(2, 1)
+    gc.set_threshold(100_000)  # as in a command: what is imported lives on
     machine.use(cores=cores, memory=memory)
     _limit(memory)
     die_with_parent()
