@@ -31,7 +31,6 @@ from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
 
 UTM = CRS.from_epsg(32632)
-EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
 PLACE = [414_690.0, 4_940_690.0]
 
 
@@ -41,7 +40,7 @@ def tiled(xyz, folder, *, chunk=30_000, block=1.0):
     collector = Collector(folder, most=1000, block=block)
     for k in range(0, len(xyz), chunk):
         collector.add(xyz[k : k + chunk])
-    cloud = collector.cloud(UTM, None, *EVERYWHERE)
+    cloud = collector.cloud(UTM, None)
     assert isinstance(cloud, TiledCloud)
     return cloud
 
@@ -73,7 +72,7 @@ def test_few_points_stay_in_memory(tmp_path):
     collector = Collector(tmp_path, most=1000)
     for k in range(0, 1000, 130):
         collector.add(xyz[k : k + 130])
-    cloud = collector.cloud(UTM, "DHHN2016 height", *EVERYWHERE)
+    cloud = collector.cloud(UTM, "DHHN2016 height")
     assert isinstance(cloud, PointCloud)
     assert np.array_equal(cloud.xyz, xyz)
     assert cloud.vertical == "DHHN2016 height"

@@ -118,7 +118,9 @@ class Collector:
         self.xyz = np.empty((0, 3))
         self._to_tiles(xyz)
 
-    def cloud(self, crs: CRS, vertical: str | None, least: Floats, most: Floats) -> Cloud:
+    def cloud(
+        self, crs: CRS, vertical: str | None, least: Floats | float = -np.inf, most: Floats | float = np.inf
+    ) -> Cloud:
         """What was taken and lies between two corners (3,)."""
         if not self.tiles:
             xyz, classes = _parted(self.xyz)
@@ -178,11 +180,10 @@ def moved(cloud: Cloud, by: Values, collector: Collector) -> Cloud:
     for part in cloud.parts():
         there = part.xyz + way
         collector.add(there if part.classification is None else np.column_stack([there, part.classification]))
-    everywhere = np.full(3, np.inf)
-    return replace(collector.cloud(cloud.crs, cloud.vertical, -everywhere, everywhere), remarks=cloud.remarks)
+    return replace(collector.cloud(cloud.crs, cloud.vertical), remarks=cloud.remarks)
 
 
-def _between(tile: Tile, least: Floats, most: Floats) -> Tile:
+def _between(tile: Tile, least: Floats | float, most: Floats | float) -> Tile:
     """A tile, on disk too, with no points but those between two corners (3,)."""
     if (tile.low >= least).all() and (tile.high <= most).all():
         return tile

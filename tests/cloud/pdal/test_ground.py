@@ -34,8 +34,7 @@ def soil(xyz):
 def tiled(xyz, folder):
     collector = Collector(folder, most=1000)
     collector.add(xyz)
-    everywhere = np.full(3, np.inf)
-    return collector.cloud(UTM, "datum", -everywhere, everywhere)
+    return collector.cloud(UTM, "datum")
 
 
 def by_pdal(**options):

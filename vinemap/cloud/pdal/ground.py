@@ -75,8 +75,7 @@ def classified(cloud: Cloud, ground: GroundOptions, collector: Collector) -> Clo
             if len(points):
                 collector.add(points)
     _check(collector.size, np.empty((0, 4)), *cloud.extent, name)
-    everywhere = np.full(3, np.inf)
-    return replace(collector.cloud(cloud.crs, cloud.vertical, -everywhere, everywhere), remarks=cloud.remarks)
+    return replace(collector.cloud(cloud.crs, cloud.vertical), remarks=cloud.remarks)
 
 
 def _with_surroundings(cloud: TiledCloud) -> Iterator[tuple[Floats, NDArray[np.bool_]]]:
