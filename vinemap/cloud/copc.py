@@ -11,10 +11,8 @@ from vinemap.cloud.las_end import OURS
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from vinemap.cloud.formats.box import Box
     from vinemap.cloud.layout import Layout
-    from vinemap.compute.arrays import Floats
-
-    Box = tuple[Floats, Floats]
 
 MOST_FOUND = 20_000_000
 """Points of nodes that are held at once, about 2 GB."""
@@ -61,7 +59,7 @@ def points_about(path: Path, layout: Layout, box: Box, selection: Any) -> Any | 
             near = [node for node in load_octree_for_query(stream, info, page, Bounds(*box)) if node.point_count]
             if sum(node.point_count for node in near) > MOST_FOUND:
                 return None
-            points = _unpacked(stream, reader, near)
+            points = unpacked(_packed(stream, near), reader, near)
             return points if _in_place(points, near) else None
     except OURS:
         raise
@@ -107,15 +105,27 @@ def _fits(info: Any, header: Any) -> bool:
     return bool(info.halfsize <= WIDEST * sides.max() and (beyond <= 2 * header.scales).all())
 
 
-def _unpacked(stream: IO[bytes], reader: Any, nodes: list[Any]) -> Any:
-    import lazrs
-    from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
+def near_file(box: Box, header: Any) -> Box:
+    """A box without what is farther from a file's extent than that is wide: laspy's query counts in whole numbers."""
+    reach = header.maxs - header.mins
+    low, high = (np.clip(corner, header.mins - reach, header.maxs + reach) for corner in box)
+    return low, high
 
-    header = reader.header
+
+def _packed(stream: IO[bytes], nodes: list[Any]) -> bytearray:
     packed = bytearray()
     for node in nodes:
         stream.seek(node.offset)
         packed += stream.read(node.byte_size)
+    return packed
+
+
+def unpacked(packed: bytes | bytearray, reader: Any, nodes: list[Any]) -> Any:
+    """Points of nodes, whose packed bytes stand one behind the other, as laspy gives them."""
+    import lazrs
+    from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
+
+    header = reader.header
     out = np.zeros(sum(node.point_count for node in nodes) * header.point_format.size, np.uint8)
     table = [(node.point_count, node.byte_size) for node in nodes]
     packing = reader.laszip_vlr.record_data

@@ -8,22 +8,21 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import shapely
 
 from vinemap.cloud.aside import placed
-from vinemap.cloud.copc import is_copc, points_about
+from vinemap.cloud.copc import is_copc, near_file, points_about
 from vinemap.cloud.files import listed, worded
-from vinemap.cloud.formats.box import MOST_OUTSIDE, STRAYS, n_outside, stated_box
+from vinemap.cloud.formats.box import box_about, check_outside, most_strays, n_outside, stated_box
 from vinemap.cloud.formats.chunks import other_chunks
 from vinemap.cloud.formats.kinds import kind_of
-from vinemap.cloud.formats.told import needed
+from vinemap.cloud.formats.told import CHUNK, needed, usable_among
 from vinemap.cloud.las_end import OURS as NOT_THEIRS
 from vinemap.cloud.layout import read_layout
 from vinemap.cloud.tiles import Collector
 from vinemap.compute.threads import ahead
 from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideError
 from vinemap.geo.boundaries import Boundary, boundary_in
-from vinemap.geo.crs import horizontal, metric_crs, project, vertical_name
+from vinemap.geo.crs import metric_crs, vertical_name
 from vinemap.geo.place import Place
 from vinemap.geo.stated import crs_of, examined
 from vinemap.geo.zones import deal, zones_of
@@ -34,13 +33,11 @@ if TYPE_CHECKING:
 
     from pyproj import CRS
 
-    from vinemap.cloud.copc import Box
+    from vinemap.cloud.formats.box import Box
     from vinemap.cloud.layout import Layout
     from vinemap.cloud.tiles import Cloud
     from vinemap.compute.arrays import Floats
 
-CHUNK = 500_000
-"""Points that are decompressed at once."""
 MOST_BYTES = 256_000_000
 """Of points that are held at once as they are in the file."""
 SMALL = 0.25
@@ -259,7 +256,7 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
             blank += _n_blank(chunk)
             columns = [np.asarray(column) for column in (chunk.x, chunk.y, chunk.z)]
             beyond += n_outside(columns, box)
-            xyz = _usable(np.column_stack(columns), chunk)
+            xyz = usable_among(np.column_stack(columns), chunk)
             if len(xyz):
                 yield xyz
     except OURS:
@@ -268,13 +265,9 @@ def _usable_chunks(reader: Any, path: Path, found: Any | None) -> Iterator[Float
         raise unreadable(path, error) from error
     if done < total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
-    if blank > max(STRAYS, MOST_OUTSIDE * done):
+    if blank > most_strays(done):
         raise InputError(f"{path}: {blank:,} of its points hold nothing but zeros: copy or download it again")
-    if beyond > max(STRAYS, MOST_OUTSIDE * done):
-        raise InputError(
-            f"{path}: {beyond:,} points lie outside of the box that its header states, as in damaged files: copy or "
-            "download it again, or have its header written anew"
-        )
+    check_outside(beyond, done, path)
 
 
 def _n_blank(chunk: Any) -> int:
@@ -288,15 +281,9 @@ def _small_box(header: Any, source: CRS, around: Boundary) -> Box | None:
     """Corners (3,) about a polygon in a file's CRS, if the file is a COPC and they hold little of it."""
     if not is_copc(header):
         return None
-    west, south, east, north = shapely.bounds(project(*around, horizontal(source))).tolist()
-    margin = 0.01 * max(east - west, north - south)
-    low, high = np.array([west, south]) - margin, np.array([east, north]) + margin
-    least, most = header.mins, header.maxs
-    if not np.prod(high - low) < SMALL * np.prod((most - least)[:2]):
-        return None
-    # Not far beyond the file's extent, as the query counts in whole numbers; all heights.
-    limits = least - (most - least), most + (most - least)
-    return np.clip([*low, -np.inf], *limits), np.clip([*high, np.inf], *limits)
+    low, high = box_about(around, source)
+    small = np.prod((high - low)[:2]) < SMALL * np.prod((header.maxs - header.mins)[:2])
+    return near_file((low, high), header) if small else None
 
 
 def _none_inside(files: Sequence[Path]) -> OutsideError:
@@ -313,17 +300,6 @@ def unreadable(path: Path, error: BaseException) -> InputError | BusyError:
     if RAN_OUT in reason:
         reason = "its packed points are damaged"
     return InputError(f"{path}: can't be read as LAS or LAZ ({reason}): is it whole?")
-
-
-def _usable(xyz: Floats, chunk: Any) -> Floats:
-    """Coordinates (n, 3) of the points of a chunk that aren't flagged as noise and are numbers, out of all of them."""
-    classes = np.asarray(chunk.classification)
-    noise = (classes == 7) | (classes == 18) | np.asarray(chunk.withheld, dtype=bool)
-    if noise.any():
-        xyz = xyz[~noise]
-    if not np.isfinite(xyz.sum()):
-        xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    return xyz
 
 
 def _plausible(sample: Floats, of: str) -> tuple[Floats, Floats]:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from vinemap.errors import InputError
 from vinemap.geo.crs import horizontal, project
-from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
+    from pathlib import PurePath
 
     from pyproj import CRS
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     Box = tuple[Floats, Floats]
 
+EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
+"""Corners (3,) of all of space."""
 MARGIN = 0.001
 """Share of its wider side that is added all around, as straight lines of one CRS bend in another."""
 LOOSE = 0.003
@@ -29,14 +31,9 @@ MOST_OUTSIDE, STRAYS = 0.0001, 3
 """Share of the points that may lie farther outside, and a number of them that always may."""
 
 
-def box_about(boundary: Boundary | None, header: Any, crs: CRS | None, path: Path) -> Box:
-    """Corners (3,) about a polygon in the CRS that is given or that a file's header states; of all heights.
-
-    Without a polygon it is all of space.
-    """
-    if boundary is None:
-        return np.full(3, -np.inf), np.full(3, np.inf)
-    west, south, east, north = shapely.bounds(project(*boundary, horizontal(crs_of(header, crs, path)))).tolist()
+def box_about(boundary: Boundary, crs: CRS) -> Box:
+    """Corners (3,) about a polygon in the CRS of a file; of all heights."""
+    west, south, east, north = shapely.bounds(project(*boundary, horizontal(crs))).tolist()
     margin = MARGIN * max(east - west, north - south)
     return np.array([west - margin, south - margin, -np.inf]), np.array([east + margin, north + margin, np.inf])
 
@@ -61,3 +58,23 @@ def n_outside(columns: Sequence[Floats] | Floats, box: Box | None) -> int:
     if all(low <= column.min() and column.max() <= high for column, low, high in within):
         return 0
     return int(np.any([(column < low) | (column > high) for column, low, high in within], axis=0).sum())
+
+
+def most_strays(n: int) -> float:
+    """How many of n points may be out of place in a file that isn't damaged."""
+    return max(STRAYS, MOST_OUTSIDE * n)
+
+
+def check_outside(outside: int, n: int, path: PurePath) -> None:
+    """Make sure that of n points of a file few lie outside of the box that its header states.
+
+    Raises
+    ------
+    InputError
+        If more do.
+    """
+    if outside > most_strays(n):
+        raise InputError(
+            f"{path}: {outside:,} points lie outside of the box that its header states, as in damaged files: copy or "
+            "download it again, or have its header written anew"
+        )

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vinemap import paths
-from vinemap.cloud.formats.box import box_about, meet
+from vinemap.cloud.formats.box import EVERYWHERE, box_about, meet
 from vinemap.cloud.formats.told import Header, Points, columns_of, needed, reading, usable_records
 from vinemap.cloud.layout import read_layout
 from vinemap.errors import InputError
+from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -85,7 +86,7 @@ def read_ept(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
         stored = {one["name"]: (float(one.get("scale", 1)), float(one.get("offset", 0))) for one in about["schema"]}
     if kind not in {"laszip", "binary"}:
         raise InputError(f"{path}: its points are packed as {kind}: export them as LAZ or COPC")
-    box = box_about(around, header, crs, path)
+    box = box_about(around, crs_of(header, crs, path)) if around else EVERYWHERE
     packed = None if kind == "laszip" else _Packing(dtype, *np.transpose([stored[axis] for axis in AXES]))
     return Points(header, _read(path, bounds, box, packed, None if around else header.point_count))
 

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
-import numpy as np
-
 from vinemap import naming
-from vinemap.cloud.copc import is_copc
-from vinemap.cloud.formats.box import box_about
+from vinemap.cloud.copc import is_copc, near_file, unpacked
+from vinemap.cloud.formats.box import EVERYWHERE, box_about
 from vinemap.cloud.formats.told import CHUNK, Points, needed, reading, usable_records
 from vinemap.cloud.las_end import LATE_RECORD
 from vinemap.errors import BusyError, InputError
+from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -168,7 +167,7 @@ def read_remote(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
             raise InputError(f"{stream.url}: is no COPC, of which parts can be fetched: download it, and give the file")
         if not reader.header.vlrs.get_by_id("LASF_Projection"):
             reader.header.evlrs = _projections(stream, reader.header)
-    box = box_about(around, reader.header, crs, path)
+    box = box_about(around, crs_of(reader.header, crs, path)) if around else EVERYWHERE
     return Points(reader.header, _read(path, stream, reader, box))
 
 
@@ -189,10 +188,7 @@ def _projections(stream: Ranges, header: Any) -> Any:
 def _read(path: Path, stream: Ranges, reader: Any, box: Box) -> Generator[Floats]:
     from laspy.copc import Bounds, load_octree_for_query
 
-    header = reader.header
-    # Not far beyond the file's extent, as the query counts in whole numbers.
-    limits = header.mins - (header.maxs - header.mins), header.maxs + (header.maxs - header.mins)
-    near = Bounds(*(np.clip(corner, *limits) for corner in box))
+    near = Bounds(*near_file(box, reader.header))
     with reading(path, "COPC"):
         nodes = load_octree_for_query(stream, reader.copc_info, reader.root_page, near)
         nodes = sorted((node for node in nodes if node.point_count > 0), key=lambda node: node.offset)
@@ -202,7 +198,8 @@ def _read(path: Path, stream: Ranges, reader: Any, box: Box) -> Generator[Floats
         start = group[0].offset
         data = stream.fetch(start, group[-1].offset + group[-1].byte_size)
         with reading(path, "COPC"):
-            yield usable_records(_unpacked(reader, group, data, start))
+            packed = b"".join(data[node.offset - start : node.offset - start + node.byte_size] for node in group)
+            yield usable_records(unpacked(packed, reader, group))
 
 
 def _together(nodes: list[Any]) -> Generator[list[Any]]:
@@ -219,19 +216,3 @@ def _together(nodes: list[Any]) -> Generator[list[Any]]:
         group.append(node)
     if group:
         yield group
-
-
-def _unpacked(reader: Any, nodes: list[Any], data: bytes, start: int) -> Any:
-    """Points of nodes, whose bytes are in those from a place in the file on."""
-    import lazrs
-    from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
-
-    header = reader.header
-    packed = b"".join(data[node.offset - start : node.offset - start + node.byte_size] for node in nodes)
-    out = np.zeros(sum(node.point_count for node in nodes) * header.point_format.size, np.uint8)
-    table = [(node.point_count, node.byte_size) for node in nodes]
-    lazrs.decompress_points_with_chunk_table(
-        packed, reader.laszip_vlr.record_data, out, table, reader.decompression_selection
-    )
-    record = PackedPointRecord.from_buffer(out, header.point_format)
-    return ScaleAwarePointRecord(record.array, record.point_format, header.scales, header.offsets)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.cloud.formats.box import box_about
+from vinemap.cloud.formats.box import EVERYWHERE, box_about
 from vinemap.cloud.formats.told import CHUNK, Header, Points, reading, unit_of, usable
 from vinemap.errors import InputError
 from vinemap.geo.crs import vertical, vertical_unit
@@ -77,7 +77,8 @@ def read_surface(path: Path, crs: CRS | None, around: Boundary | None) -> Points
     step = step_of(some) * size * vertical_unit(source)
     coarse = f"{path.name} has heights in steps of {step:.2g} m, in which canopies hardly show: export it with decimals"
     remarks = remark, *([coarse] if step > COARSE else []), *(() if unit else doubts_of_heights(source))
-    chunks = _read(path, box_about(around, header, crs, path), size, blanks=_blanks(some))
+    box = box_about(around, source) if around else EVERYWHERE
+    chunks = _read(path, box, size, blanks=_blanks(some))
     return Points(header, chunks, remarks, steps=False)
 
 

@@ -189,11 +189,18 @@ def needed() -> Any:
 
 
 def usable_records(records: Any) -> Floats:
-    """Coordinates (n, 3) of the points that are numbers, and neither flagged as noise nor withheld."""
-    xyz = np.column_stack([np.asarray(column) for column in (records.x, records.y, records.z)])
-    held = np.asarray(records.withheld, dtype=bool)
-    classes = np.asarray(records.classification)
-    return usable(xyz[~held], classes[~held]) if held.any() else usable(xyz, classes)
+    """Coordinates (n, 3) of laspy's points that are numbers, and neither flagged as noise nor withheld."""
+    return usable_among(np.column_stack([np.asarray(column) for column in (records.x, records.y, records.z)]), records)
+
+
+def usable_among(xyz: Floats, records: Any) -> Floats:
+    """The same, of the coordinates (n, 3) of all of them."""
+    noise = np.isin(np.asarray(records.classification), NOISE) | np.asarray(records.withheld, dtype=bool)
+    if noise.any():
+        xyz = xyz[~noise]
+    if not np.isfinite(xyz.sum()):
+        xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    return xyz
 
 
 def unit_of(said: str) -> float | None:

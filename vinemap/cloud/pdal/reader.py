@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap import naming, paths
-from vinemap.cloud.formats.box import MOST_OUTSIDE, STRAYS, box_about, n_outside, stated_box
+from vinemap.cloud.formats.box import box_about, check_outside, n_outside, stated_box
 from vinemap.cloud.formats.ept import read_ept
 from vinemap.cloud.formats.kinds import kind_of
 from vinemap.cloud.formats.told import Header, Points
@@ -19,6 +19,7 @@ from vinemap.cloud.pdal.engine import load_pdal
 from vinemap.cloud.pdal.stages import read
 from vinemap.compute.apart import apart
 from vinemap.errors import BusyError, InputError, VinemapError, WorkerError, reason_of
+from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
@@ -51,7 +52,7 @@ def read_pdal(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
     kind, known = _look(path)
     options: dict[str, Any] = {"type": f"readers.{kind}"} if kind in {"las", "copc"} else {}
     if known and around and kind in {"copc", "ept"}:
-        options["bounds"] = _bounds(*box_about(around, known, crs, path))
+        options["bounds"] = _bounds(*box_about(around, crs_of(known, crs, path)))
     chunks = _chunks(path, options, known)
     told = next(chunks)
     return Points(known or _header(told), chunks)
@@ -95,11 +96,7 @@ def _chunks(path: Path, options: dict[str, Any], known: Any) -> Generator[Any]:
             yield xyz
     if las and "bounds" not in options and done != total:
         raise InputError(f"{path}: ends after {done} of {total} points: copy or download it again")
-    if beyond > max(STRAYS, MOST_OUTSIDE * done):
-        raise InputError(
-            f"{path}: {beyond:,} points lie outside of the box that its header states, as in damaged files: copy or "
-            "download it again, or have its header written anew"
-        )
+    check_outside(beyond, done, path)
 
 
 @contextmanager
