@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 LONGEST_NAME = 64
 MOST_BYTES = 160
@@ -43,6 +43,11 @@ class Address(PurePosixPath):
         """Address of the file."""
         scheme, _, rest = super().__str__().partition(":/")
         return f"{scheme}://{rest.lstrip('/')}"
+
+
+def named(cloud: Path) -> PurePath:
+    """A cloud's path as a sentence has it: of one on a web server its address."""
+    return Address(cloud.as_posix()) if url_of(cloud) else cloud
 
 
 def shown(path: Path | str) -> str:

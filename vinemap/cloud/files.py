@@ -154,4 +154,4 @@ def _rank(path: Path) -> tuple[bool, bool, bool]:
 def worded(files: Sequence[Path]) -> str:
     """Files as an error names them."""
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return f"{naming.url_of(files[0]) or files[0]}{more}"
+    return f"{naming.named(files[0])}{more}"

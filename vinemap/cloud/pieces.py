@@ -78,7 +78,7 @@ def split_cloud(
         polygons, drafts = [], []
         for number, boundary in enumerate(boundaries):
             try:
-                polygons.append(boundary_in(boundary, place.crs, files[0]))
+                polygons.append(boundary_in(boundary, place.crs, naming.named(files[0])))
             except InputError as error:
                 pieces.append(error)
             else:

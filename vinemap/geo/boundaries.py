@@ -17,7 +17,7 @@ from vinemap.geo.place import check_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     import geopandas as gpd
     import pandas as pd
@@ -310,7 +310,7 @@ def _polygon_layers(path: Path, layers: Sequence[Layer]) -> Sequence[Layer]:
     return named or found[:1]
 
 
-def boundary_in(boundary: Boundary, target: CRS, path: Path) -> shapely.Geometry:
+def boundary_in(boundary: Boundary, target: CRS, path: PurePath) -> shapely.Geometry:
     """A boundary's polygon in the CRS to which a file is brought.
 
     Raises

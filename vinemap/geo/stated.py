@@ -35,7 +35,7 @@ from vinemap.geo.place import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from pathlib import PurePath
 
     from vinemap.compute.arrays import Floats
     from vinemap.geo.place import Place
@@ -64,7 +64,7 @@ DEGREE = float(np.radians(GLOBE))
 """Metres of a degree of latitude."""
 
 
-def crs_of(header: Any, given: CRS | None, path: Path) -> CRS:
+def crs_of(header: Any, given: CRS | None, path: PurePath) -> CRS:
     """The CRS of a file's coordinates: what is given, or what its header states.
 
     Heights are what the header states of them, where what is given tells nothing of heights.
@@ -92,7 +92,7 @@ def crs_of(header: Any, given: CRS | None, path: Path) -> CRS:
     return check_horizontal(CompoundCRS(f"{plain.name} + {up.name}", [stated(plain), up]), f"{path}: ")
 
 
-def _horizontal(header: Any, path: Path) -> CRS | None:
+def _horizontal(header: Any, path: PurePath) -> CRS | None:
     """The CRS that a header states, in WKT or in GeoTIFF keys; where it does both, they must lead to one place."""
     text: CRS | None = header.parse_crs()
     codes: CRS | None = header.parse_crs(prefer_wkt=False)
@@ -200,7 +200,7 @@ def _units() -> dict[int, float]:
     return {int(unit.code): unit.conv_factor for unit in get_units_map("EPSG", category="linear").values()}
 
 
-def check_together(source: CRS, place: Place, path: Path, first: Path) -> None:
+def check_together(source: CRS, place: Place, path: PurePath, first: PurePath) -> None:
     """Make sure that a file's points can be brought to the place of the first.
 
     Raises
@@ -223,7 +223,7 @@ def check_together(source: CRS, place: Place, path: Path, first: Path) -> None:
         )
 
 
-def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) -> Floats:
+def to_place(xyz: Floats, source: CRS, path: PurePath, place: Place, first: PurePath) -> Floats:
     """Points (n, 3) of a file, which are changed, in metres of the place of the first; without those that have none.
 
     Raises
@@ -240,7 +240,7 @@ def to_place(xyz: Floats, source: CRS, path: Path, place: Place, first: Path) ->
     return xyz
 
 
-def examined(xyz: Floats, header: Any, source: CRS, path: Path, *, given: bool = False) -> list[str]:
+def examined(xyz: Floats, header: Any, source: CRS, path: PurePath, *, given: bool = False) -> list[str]:
     """What is to be known of where a file's points are, some of which (n, 3) are in its CRS, which may be given.
 
     Raises
@@ -256,7 +256,7 @@ def examined(xyz: Floats, header: Any, source: CRS, path: Path, *, given: bool =
     return [*_overridden(header, source, x, y, path), *doubts] if given else doubts
 
 
-def _overridden(header: Any, given: CRS, x: float, y: float, path: Path) -> list[str]:
+def _overridden(header: Any, given: CRS, x: float, y: float, path: PurePath) -> list[str]:
     """Whether a file states a CRS that leads elsewhere than the one that is given for it, and perhaps for others."""
     try:
         own = _horizontal(header, path)
@@ -265,7 +265,7 @@ def _overridden(header: Any, given: CRS, x: float, y: float, path: Path) -> list
     return doubts_of_given(given, own, x, y, path.name) if own else []
 
 
-def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: Path) -> None:
+def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: PurePath) -> None:
     """Make sure that points of a file aren't stored more coarsely than they lie apart.
 
     The steps are those that the file's scale states, or greater ones that the coordinates show: they may have been

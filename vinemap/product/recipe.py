@@ -70,7 +70,7 @@ class Source(NamedTuple):
         except InputError:
             same = False
         if not same:
-            raise BusyError(f"{self.path}: changed while it was read: try again when it stays as it is")
+            raise BusyError(f"{naming.named(self.path)}: changed while it was read: try again when it stays as it is")
 
 
 def read_source(path: Path, known: Iterable[Source] = ()) -> Source:

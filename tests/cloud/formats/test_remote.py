@@ -27,13 +27,16 @@ def folder(tmp_path_factory):
     write_copc(
         folder / "a.copc.laz", np.random.default_rng(0).uniform(LOW, HIGH, (30_000, 3)).round(3), levels=3, noise={3}
     )
-    (folder / "plain.laz").write_bytes((folder / "a.copc.laz").read_bytes().replace(b"copc", b"cops"))
+    data = (folder / "a.copc.laz").read_bytes()
+    points, behind = int.from_bytes(data[96:100], "little"), int.from_bytes(data[235:243], "little")
+    (folder / "plain.laz").write_bytes(data.replace(b"copc", b"cops"))
+    (folder / "nowhere.laz").write_bytes(data.replace(b"LASF_Projection", b"LASF_Elsewhere."))
+    (folder / "damaged.laz").write_bytes(data[: points + 40].ljust(behind, b"\xff") + data[behind:])
     return folder
 
 
 @pytest.fixture(autouse=True)
 def hasty(monkeypatch):
-    monkeypatch.setattr(remote, "PATIENCE", 0.3)
     monkeypatch.setattr(remote, "PAUSE", 0.01)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
@@ -80,7 +83,9 @@ def test_parcels_of_a_survey_are_fetched_at_once(folder, tmp_path):
 
 
 @pytest.mark.parametrize("fault", [{"breaks": 3}, {"stalls": 1}, {"refusals": [503, 429]}])
-def test_what_passes_is_asked_for_again(folder, fault):
+def test_what_passes_is_asked_for_again(folder, monkeypatch, fault):
+    if "stalls" in fault:
+        monkeypatch.setattr(remote, "PATIENCE", 0.3)
     with serving(folder, **fault) as server:
         cloud = read_cloud(address(server), boundary=BOX)
     assert cloud.size == read_cloud(folder / "a.copc.laz", boundary=BOX).size
@@ -104,10 +109,13 @@ def test_an_answer_that_broke_off_is_not_fetched_twice(folder):
         ({"refusals": [403]}, "a.copc.laz", InputError, "it may not be read .the server says 403"),
         ({}, "b.copc.laz", InputError, "b.copc.laz: there is no such file .the server says 404"),
         ({}, "plain.laz", InputError, "is no COPC, of which parts can be fetched: download it"),
+        ({}, "nowhere.laz", InputError, "states no CRS for its coordinates: give it with --crs"),
+        ({}, "damaged.laz", InputError, "can't be read as COPC .*: is it whole"),
     ],
 )
 def test_a_server_that_fails_is_told_in_a_line(folder, monkeypatch, how, name, kind, reason):
-    monkeypatch.setattr(remote, "PATIENCE", 0.05)
+    if "stalls" in how:
+        monkeypatch.setattr(remote, "PATIENCE", 0.05)
     with serving(folder, silence=0.3, **how) as server, pytest.raises(kind, match=reason) as caught:
         read_cloud(address(server, name), boundary=BOX)
     assert f"{server.url}/{name}: " in str(caught.value)

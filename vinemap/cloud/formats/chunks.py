@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from vinemap.geo.stated import crs_of, examined
 
 if TYPE_CHECKING:
     from collections.abc import Generator
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     from pyproj import CRS
 
@@ -56,12 +56,12 @@ def other_chunks(
     BusyError
         If it can't be read now.
     """
-    kind, named = kind_of(path) or "", _named(path)
+    kind, named = kind_of(path) or "", naming.named(path)
     points = _opened(path, kind, crs, around, engine)
-    with closing(points.chunks) as chunks, reading(path, WORDS.get(kind, kind.upper())):
+    with closing(points.chunks) as chunks, reading(named, WORDS.get(kind, kind.upper())):
         first = next((chunk for chunk in chunks if len(chunk)), None)
         if first is None and (around is None or kind in WHOLE):
-            raise EmptyError(f"{path}: holds no usable points (all are flagged as noise or have no number)")
+            raise EmptyError(f"{named}: holds no usable points (all are flagged as noise or have no number)")
         if first is None:
             return
         header = _with_box(points, first)
@@ -84,11 +84,6 @@ def _opened(path: Path, kind: str, crs: CRS | None, around: Boundary | None, eng
     return WHOLE[kind](path)
 
 
-def _named(path: Path) -> Path:
-    """A path as it is written in a sentence."""
-    return cast("Path", naming.Address(path.as_posix())) if naming.url_of(path) else path
-
-
 def _with_box(points: Points, first: Floats) -> Header:
     """What a file tells of itself, with the box of its first points where it states none: whose CRS is asked for."""
     header = points.header
@@ -97,7 +92,7 @@ def _with_box(points: Points, first: Floats) -> Header:
     return replace(header, mins=first.min(axis=0), maxs=first.max(axis=0), point_count=len(first))
 
 
-def _check_units(header: Header, source: CRS, path: Path) -> None:
+def _check_units(header: Header, source: CRS, path: PurePath) -> None:
     """Make sure that coordinates are in the units of their CRS, where a file tells units of its own."""
     flat = horizontal(source)
     units = [(axis, flat.axis_info[0].unit_name, flat.axis_info[0].unit_conversion_factor) for axis in "xy"]
@@ -110,7 +105,7 @@ def _check_units(header: Header, source: CRS, path: Path) -> None:
             )
 
 
-def _checked(first: Floats, points: Points, header: Header, source: CRS, path: Path, *, given: bool) -> list[str]:
+def _checked(first: Floats, points: Points, header: Header, source: CRS, path: PurePath, *, given: bool) -> list[str]:
     """What is to be known of where points are, in a sentence each."""
     if points.steps:
         return examined(first, header, source, path, given=given)

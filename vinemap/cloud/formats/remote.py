@@ -19,7 +19,7 @@ from vinemap.geo.stated import crs_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     from pyproj import CRS
 
@@ -158,17 +158,17 @@ def read_remote(path: Path, crs: CRS | None, around: Boundary | None) -> Points:
     """
     from laspy.copc import CopcReader
 
-    stream = Ranges(path)
+    stream, named = Ranges(path), naming.named(path)
     if not stream.beginning.startswith(b"LASF") or b"copc" not in stream.beginning[375:600]:
         raise InputError(f"{stream.url}: is no COPC, of which parts can be fetched: download it, and give the file")
-    with reading(path, "COPC"):
+    with reading(named, "COPC"):
         reader = CopcReader(stream, decompression_selection=needed())
         if not is_copc(reader.header):
             raise InputError(f"{stream.url}: is no COPC, of which parts can be fetched: download it, and give the file")
         if not reader.header.vlrs.get_by_id("LASF_Projection"):
             reader.header.evlrs = _projections(stream, reader.header)
-    box = box_about(around, crs_of(reader.header, crs, path)) if around else EVERYWHERE
-    return Points(reader.header, _read(path, stream, reader, box))
+    box = box_about(around, crs_of(reader.header, crs, named)) if around else EVERYWHERE
+    return Points(reader.header, _read(named, stream, reader, box))
 
 
 def _projections(stream: Ranges, header: Any) -> Any:
@@ -185,7 +185,7 @@ def _projections(stream: Ranges, header: Any) -> Any:
     return found
 
 
-def _read(path: Path, stream: Ranges, reader: Any, box: Box) -> Generator[Floats]:
+def _read(path: PurePath, stream: Ranges, reader: Any, box: Box) -> Generator[Floats]:
     from laspy.copc import Bounds, load_octree_for_query
 
     near = Bounds(*near_file(box, reader.header))

@@ -15,7 +15,7 @@ from vinemap.errors import PASSING, BusyError, InputError, VinemapError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Mapping, Sequence
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     from numpy.typing import NDArray
 
@@ -90,7 +90,7 @@ class Points(NamedTuple):
 
 
 @contextmanager
-def reading(path: Path, kind: str) -> Iterator[None]:
+def reading(path: PurePath, kind: str) -> Iterator[None]:
     """Say in a line what libraries raise of a file that they can't read."""
     try:
         yield
