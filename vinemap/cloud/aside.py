@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinemap.geo.stated import to_place
-
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Sequence
-    from pathlib import Path
-
-    from pyproj import CRS
+    from collections.abc import Generator, Iterable
+    from pathlib import PurePath
 
     from vinemap.compute.arrays import Flags, Floats
-    from vinemap.geo.place import Place
 
-    Tops = dict[int, dict[Path, Floats]]
+    Tops = dict[int, dict[PurePath, Floats]]
     """Highest points of each file in the cells of patches of ground."""
 
 EVERY, MOST = 16.0, 60
@@ -47,16 +42,12 @@ LEAST, FEWEST, AGREED = 0.3, 4, 0.7
 """Metres aside that matter, patches that must tell of them, and share of all that tell anything."""
 
 
-def placed(
-    chunks: Iterable[tuple[Floats, CRS, Path]], place: Place, files: Sequence[Path], remarks: list[str]
-) -> Generator[Floats]:
-    """Points (n, 3) of files in metres of a place, chunk by chunk; at the end it is added if files lie aside."""
+def watched(chunks: Iterable[tuple[Floats, PurePath]], remarks: list[str]) -> Generator[Floats]:
+    """Points (n, 3) of several files in metres, as their chunks come; at the end it is added if two lie aside."""
     tops: Tops = {}
-    for xyz, source, path in chunks:
-        points = to_place(xyz, source, path, place, files[0])
-        if len(files) > 1:
-            _add(tops, points, path)
-        yield points
+    for xyz, path in chunks:
+        _add(tops, xyz, path)
+        yield xyz
     if (metres := _aside(tops)) is not None:
         remarks.append(
             f"two flights lie about {metres:.1f} m aside of each other, and canopies come out too wide, or rows twice: "
@@ -64,7 +55,7 @@ def placed(
         )
 
 
-def _add(tops: Tops, xyz: Floats, path: Path) -> None:
+def _add(tops: Tops, xyz: Floats, path: PurePath) -> None:
     """Note the highest of a file's points (n, 3) in each cell of the patches."""
     cells = max(1.0, np.prod(np.ptp(xyz[:, :2], axis=0)) / CELL**2) if len(xyz) else 1.0
     xyz = xyz[:: max(1, int(len(xyz) / cells / DENSE))]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vinemap.cloud.aside import placed
+from vinemap import naming
+from vinemap.cloud.aside import watched
 from vinemap.cloud.copc import is_copc, near_file, points_about
 from vinemap.cloud.files import listed, worded
 from vinemap.cloud.formats.box import box_about, check_outside, most_strays, n_outside, stated_box
@@ -24,12 +25,12 @@ from vinemap.errors import PASSING, BusyError, EmptyError, InputError, OutsideEr
 from vinemap.geo.boundaries import Boundary, boundary_in
 from vinemap.geo.crs import metric_crs, vertical_name
 from vinemap.geo.place import Place
-from vinemap.geo.stated import crs_of, examined
+from vinemap.geo.stated import crs_of, examined, to_place
 from vinemap.geo.zones import deal, zones_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Sequence
-    from pathlib import Path
+    from pathlib import Path, PurePath
 
     from pyproj import CRS
 
@@ -93,7 +94,7 @@ def read_cloud(
     """
     points, files = collector or Collector(), listed(clouds)
     with open_cloud(files, crs=crs, around=boundary, engine=engine) as (place, chunks):
-        zones = zones_of([boundary_in(boundary, place.crs, files[0])]) if boundary else None
+        zones = zones_of([boundary_in(boundary, place.crs, naming.named(files[0]))]) if boundary else None
         for xyz in chunks:
             points.add(deal(xyz, zones)[0] if zones else xyz)
     return collected(points, place, files)
@@ -136,7 +137,9 @@ def open_cloud(
         except InputError as error:
             raise InputError(f"{first.path}: {error}") from error
         place = Place(target, vertical_name(first.source), remarks)
-        with ahead(placed(chain([first], chunks), place, files, remarks)) as prepared:
+        there = ((to_place(xyz, source, path, place, files[0]), path) for xyz, source, path in chain([first], chunks))
+        points = watched(there, remarks) if len(files) > 1 else (xyz for xyz, _ in there)
+        with ahead(points) as prepared:
             yield place, prepared
 
 
@@ -145,7 +148,7 @@ class _Chunk(NamedTuple):
 
     xyz: Floats
     source: CRS
-    path: Path
+    path: PurePath
 
 
 def _chunks_of(
@@ -172,7 +175,7 @@ def _chunks_in(
     """Usable points of a file."""
     if kind_of(path) or engine == "pdal":
         for xyz, source in other_chunks(path, crs, around, remarks, engine=engine):
-            yield _Chunk(xyz, source, path)
+            yield _Chunk(xyz, source, naming.named(path))
         return
     with opened(path, crs=crs) as (reader, source, layout):
         box = _small_box(reader.header, source, around) if around else None
