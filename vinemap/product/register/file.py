@@ -248,18 +248,21 @@ def _read(database: sqlite3.Connection, path: Path) -> Register:
 
 
 def _table(database: sqlite3.Connection, layer: str, path: Path) -> tuple[pd.DataFrame, CRS]:
-    column, crs, key = _layer(database, layer, path)
-    there = _columns(database, layer)
-    names = ["uid", "parcel", "row_id", "label", *(n for n in REGISTER[layer].columns if n not in (*NAMED, "uid"))]
-    chosen = [f'"{name}"' if name in there else "NULL" for name in (*names, *DATES[layer])]
+    (column, crs, key), there = _layer(database, layer, path), _columns(database, layer)
+    chosen = [f'"{name}"' if name in there else "NULL" for name in _read_columns(layer)]
     found = database.execute(f'SELECT "{key}", {", ".join(chosen)}, "{column}" FROM "{layer}" ORDER BY 1').fetchall()  # noqa: S608 - names of its own
     return _frame(found, layer), crs
 
 
+def _read_columns(layer: str) -> list[str]:
+    """Columns of a layer that are read, beside its key and its lines."""
+    return list(dict.fromkeys(["uid", *NAMED, *REGISTER[layer].columns, *DATES[layer]]))
+
+
 def _frame(found: list[tuple[Any, ...]], layer: str) -> pd.DataFrame:
-    names = ["uid", "parcel", "row_id", "label", *(n for n in REGISTER[layer].columns if n not in (*NAMED, "uid"))]
-    columns = dict(zip(("fid", *names, *DATES[layer], "line"), zip(*found, strict=True), strict=True)) if found else {}
-    of = {name: list(columns.get(name, ())) for name in ("fid", *names, *DATES[layer], "line")}
+    """A table of features as SQLite gives them: their key, the columns that are read, and their lines."""
+    names = ("fid", *_read_columns(layer), "line")
+    of = dict(zip(names, map(list, zip(*found, strict=True)) if found else ([] for _ in names), strict=True))
     how = {"fid": _whole, "uid": _whole, "row_id": _number} | dict.fromkeys(DATES[layer], _date)
     frame = pd.DataFrame(
         {name: pd.Series([how.get(name, _word)(v) for v in of[name]], dtype=object) for name in of if name != "line"}
@@ -310,7 +313,7 @@ def _of_index(kind: Any) -> Callable[[bytes | None], Any]:
 
 def _write(database: sqlite3.Connection, update: Update, path: Path) -> None:
     _, crs, key = _layer(database, ROW_LAYER, path)
-    names = ["uid", *NAMED, "survey", *DATES[ROW_LAYER]]
+    names = _read_columns(ROW_LAYER)
     is_new = update.rows["fid"].isna().to_numpy()
     changed = update.rows[update.rows["dirty"].to_numpy(dtype=bool) & ~is_new]
     settings = ", ".join(f'"{name}" = ?' for name in names)
