@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinemap.product.qgis.symbology import node, options, rgba, single_symbol
+from vinemap.product.qgis.symbology import fill, node, options, rgba
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -58,7 +58,7 @@ def print_layout(
     scale = map_scale(bounds)
     return node(
         "Layout",
-        node("PageCollection", single_symbol({"color": "255,255,255,255", "outline_style": "no"}), _page()),
+        node("PageCollection", fill({"color": "255,255,255,255", "outline_style": "no"}), _page()),
         _map(bounds, scale),
         _text(title, (MAP[0], 7, PAGE[0] - MAP[0] - 30, 10), size=min(20, LETTERS * 20 / len(title)), bold=True),
         _text(" · ".join(lines["head"]), (MAP[0], 17.5, MAP[2], 7), size=10),

@@ -107,7 +107,7 @@ def _symbol(name: str, symbol: Symbol) -> Element:
     return node("symbol", *drawn, type=kind, name=name, alpha=1, clip_to_extent=1, force_rhr=0)
 
 
-def single_symbol(properties: Mapping[str, str]) -> Element:
+def fill(properties: Mapping[str, str]) -> Element:
     """A fill of its own."""
     return _symbol("", ("fill", [dict(properties)]))
 
