@@ -3,6 +3,7 @@
 import ast
 import configparser
 import sys
+from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
@@ -11,6 +12,7 @@ from commands import ROOT
 
 from vinemap import __version__, export, paths
 from vinemap.cli.main import commands
+from vinemap.cloud.formats.kinds import KINDS
 from vinemap.errors import ConfigError, OutputError
 
 SOURCES = {path.stem: path.read_text(encoding="utf-8") for path in paths.PLUGIN.glob("*.py")}
@@ -111,9 +113,18 @@ def test_parameters_are_the_options_of_the_command(name):
     assert flags | LEFT_OUT[name] == taken
 
 
+def assigned(name):
+    """Values of the constants of a file of the plugin."""
+    found = [node for node in ast.parse(SOURCES[name]).body if isinstance(node, ast.Assign)]
+    return {node.targets[0].id: node.value for node in found}
+
+
 def test_formats_are_those_of_the_command():
-    assigned = {
-        node.targets[0].id: node.value for node in ast.parse(SOURCES["export"]).body if isinstance(node, ast.Assign)
-    }
-    assert ast.literal_eval(assigned["FORMATS"]) == list(export.FORMATS)
-    assert ast.literal_eval(assigned["LINES"]) == list(export.LINES)
+    constants = assigned("export")
+    assert ast.literal_eval(constants["FORMATS"]) == list(export.FORMATS)
+    assert ast.literal_eval(constants["LINES"]) == list(export.LINES)
+
+
+def test_clouds_to_choose_are_all_that_can_be_read():
+    ends = {word.lstrip("*") for word in ast.literal_eval(assigned("algorithm")["ENDS"]).split()}
+    assert ends == {".las", ".laz", Path(paths.EPT).suffix, *KINDS}

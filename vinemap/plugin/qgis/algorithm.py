@@ -18,7 +18,8 @@ from qgis.core import (
 from qgis.PyQt.QtGui import QIcon
 
 ICON = Path(__file__).with_name("icon.svg")
-CLOUDS = "Point clouds and surface models (*.las *.laz *.json *.e57 *.ply *.pcd *.xyz *.csv *.txt *.tif);;All files (*)"
+ENDS = "*.las *.laz *.json *.e57 *.ply *.pcd *.xyz *.pts *.csv *.txt *.asc *.tif *.tiff"
+"""Of files that hold points."""
 
 
 class Command(QgsProcessingAlgorithm):
@@ -104,8 +105,18 @@ MAPPING = {
 """Options of both commands that map clouds."""
 
 
+def add_cloud(algorithm: Command) -> None:
+    """The first parameter of both."""
+    algorithm.add(
+        QgsProcessingParameterFile(
+            "CLOUD", "Point cloud", fileFilter=f"Point clouds and surface models ({ENDS});;All files (*)"
+        ),
+        "LAS, LAZ, COPC, EPT, E57, PLY, PCD, XYZ or CSV, a surface model as GeoTIFF, a folder of such, or https://…",
+    )
+
+
 def add_common(algorithm: Command) -> None:
-    """Parameters of both commands that map clouds."""
+    """Further parameters of both."""
     lines, points = QgsProcessing.TypeVectorLine, QgsProcessing.TypeVectorPoint
     algorithm.add(
         QgsProcessingParameterFeatureSource("ROWS", "Known rows", [lines, points], optional=True),

@@ -11,12 +11,11 @@ from qgis.core import (
     QgsProcessingOutputVectorLayer,
     QgsProcessingParameterBoolean,
     QgsProcessingParameterFeatureSource,
-    QgsProcessingParameterFile,
     QgsProcessingParameterFolderDestination,
     QgsProcessingParameterString,
 )
 
-from .algorithm import CLOUDS, MAPPING, Command, add_common, files
+from .algorithm import MAPPING, Command, add_cloud, add_common, files
 from .command import call
 from .loading import LAYERS, geopackages, load
 
@@ -41,10 +40,7 @@ class MapParcel(Command):
     def initAlgorithm(self, configuration: Any = None) -> None:
         """Parameters and outputs."""
         del configuration
-        self.add(
-            QgsProcessingParameterFile("CLOUD", "Point cloud", fileFilter=CLOUDS),
-            "LAS, LAZ, COPC, EPT, E57, PLY, PCD, XYZ or CSV, a surface model as GeoTIFF, a folder of such, or https://…",
-        )
+        add_cloud(self)
         polygons = [QgsProcessing.TypeVectorPolygon]
         self.add(
             QgsProcessingParameterFeatureSource("BOUNDARY", "Boundary of the parcel", polygons, optional=True),

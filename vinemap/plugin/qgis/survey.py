@@ -17,7 +17,7 @@ from qgis.core import (
     QgsProcessingParameterString,
 )
 
-from .algorithm import CLOUDS, MAPPING, Command, add_common, files
+from .algorithm import MAPPING, Command, add_cloud, add_common, files
 from .command import call
 from .loading import geopackages, load
 
@@ -45,10 +45,7 @@ class MapSurvey(Command):
         """Parameters and outputs."""
         del configuration
         number, real = QgsProcessingParameterNumber.Integer, QgsProcessingParameterNumber.Double
-        self.add(
-            QgsProcessingParameterFile("CLOUD", "Point cloud", fileFilter=CLOUDS),
-            "LAS, LAZ, COPC, EPT, E57, PLY, PCD, XYZ or CSV, a surface model as GeoTIFF, a folder of such, or https://…",
-        )
+        add_cloud(self)
         self.add(
             QgsProcessingParameterFeatureSource(
                 "BOUNDARIES", "Boundaries of the parcels", [QgsProcessing.TypeVectorPolygon]
