@@ -125,7 +125,7 @@ class EstateConfig(_Surveys):
     settle: float = Field(
         300, ge=0, le=1_000_000, description="seconds for which the files of a survey must have stayed as they are"
     )
-    cron: str = Field("0 2 * * *", description="when make nightly runs: minute, hour, day, month, weekday")
+    cron: str = Field("0 2 * * *", description="when vinemap nightly runs: minute, hour, day, month, weekday")
     timezone: str = Field("UTC", description="time zone of that, as Europe/Rome")
     _given: dict[str, Any] = PrivateAttr(default_factory=dict)
 
