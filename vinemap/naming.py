@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import unicodedata
 from pathlib import Path, PurePath, PurePosixPath
 
 LONGEST_NAME = 64
@@ -24,6 +25,11 @@ def safe(name: str) -> str:
 def _cut(name: str) -> str:
     """A name no longer than one may be, and without the end that Windows would leave out."""
     return name[:LONGEST_NAME].encode()[:MOST_BYTES].decode(errors="ignore").rstrip(". ")
+
+
+def composed(name: str) -> str:
+    """A name with its Unicode composed and its spaces single: the same, however it was typed."""
+    return " ".join(unicodedata.normalize("NFC", name).split())
 
 
 def plain(name: str) -> str:

@@ -187,7 +187,7 @@ def test_surveys_inherit_what_they_leave_open(write, tmp_path):
         write(
             "settle: 5\ncrs: EPSG:32632\njob: {limit: 60, workers: 1}\n"
             "settings: {polygon: {c: 9}, fit: {smoothing: 5}}\n"
-            "overrides: {A: {settings: {polygon: {c: 10}}}, e\u0301: {settings: {polygon: {c: 12}}}}\n"
+            "overrides: {A: {settings: {polygon: {c: 10}}}, e\u0301: &n {settings: {polygon: {c: 12}}}, North 3: *n}\n"
         )
     )
     own = tmp_path / "own.yaml"
@@ -199,12 +199,12 @@ def test_surveys_inherit_what_they_leave_open(write, tmp_path):
     assert (config.settings.polygon.c, config.settings.fit.smoothing) == (9, 6)
     a = config.of_parcel("A").settings
     assert (a.polygon.c, a.fit.smoothing, a.fit.min_gap) == (10, 6, 2)
-    own.write_text("parcels: [é, B]\n", encoding="utf-8")
+    own.write_text("parcels: [é, B,  North   3]\n", encoding="utf-8")
     config = estate.of_survey("june", own)
     assert config.of_parcel("é").settings.polygon.c == 12
-    assert list(config.overrides) == ["é"]
+    assert list(config.overrides) == ["é", "North 3"]
     assert estate.of_survey("may", None, cloud=Path("a.laz")).cloud == Path("a.laz")
-    assert list(estate.of_survey("may", None).overrides) == ["A", "é"]
+    assert list(estate.of_survey("may", None).overrides) == ["A", "é", "North 3"]
 
 
 def test_a_parcel_that_states_nothing_is_no_other_for_it(write):

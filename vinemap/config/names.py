@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 
 from vinemap.config.yaml_files import checked_by
 from vinemap.errors import ConfigError
-from vinemap.naming import safe
+from vinemap.naming import composed, safe
 
 
 def check_name(name: str) -> str:
@@ -36,15 +36,11 @@ def check_parcel(name: str) -> str:
     ConfigError
         If it is empty, a way to another folder, or no text.
     """
-    plain = " ".join(unicodedata.normalize("NFC", name).split())
+    plain = composed(name)
     if not plain.strip(". ") or {".", ".."} & set(plain.replace("\\", "/").split("/")) or not plain.isprintable():
         raise ConfigError(f"name {name!r} can't name a file, nor a parcel: use letters and digits")
     return plain
 
 
-def _composed(name: str) -> str:
-    return unicodedata.normalize("NFC", name)
-
-
-Name = Annotated[str, AfterValidator(_composed), checked_by(check_name)]
+Name = Annotated[str, checked_by(check_name), AfterValidator(check_name)]
 ParcelName = Annotated[str, checked_by(check_parcel), AfterValidator(check_parcel)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -145,10 +144,8 @@ class EstateConfig(_Surveys):
             _place(stated, own.parent)
         parcels, overrides = stated.get("parcels"), common.get("overrides")
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
-            composed = {unicodedata.normalize("NFC", str(parcel)) for parcel in parcels}
-            common["overrides"] = {
-                key: own for key, own in overrides.items() if unicodedata.normalize("NFC", str(key)) in composed
-            }
+            names = {naming.composed(str(parcel)) for parcel in parcels}
+            common["overrides"] = {key: own for key, own in overrides.items() if naming.composed(str(key)) in names}
         return validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
 
 

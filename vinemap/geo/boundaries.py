@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import unicodedata
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
 
+from vinemap import naming
 from vinemap.errors import InputError
 from vinemap.geo.crs import project
 from vinemap.geo.layers import KML, kind_of, parts_of, polygons_of, read_layers, some_of, words_of
@@ -175,7 +175,7 @@ def _found(
     table: _Table, places: list[dict[str, NDArray[np.int_]]], name: str, path: Path, *, lone: bool = False
 ) -> Parcel | InputError:
     """The polygons of a name, or why there are none."""
-    word = unicodedata.normalize("NFC", name)
+    word = naming.composed(name)
     rows = next((rows[word] for rows in places if word in rows), None)
     if rows is None and len(table.frame) == 1 and not _is_named(table, word):
         rows = np.arange(1)
