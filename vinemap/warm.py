@@ -5,12 +5,12 @@ from __future__ import annotations
 import gc
 import os
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vinemap.compute import compiled, machine
+from vinemap.compute.processes import python
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ROWS, LENGTH, SPACING = 6, 24.0, 2.5
 """Of the made-up vineyard: rows, and metres."""
 POINTS = 40_000
-BESIDE = [sys.executable, "-c", "from vinemap.warm import compile_beside as f; f()"]
+BESIDE = python("from vinemap.warm import compile_beside as f; f()")
 """What runs in a process beside this one."""
 
 

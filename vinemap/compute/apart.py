@@ -6,18 +6,17 @@ import os
 import pickle
 import signal
 import subprocess
-import sys
 import tempfile
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any
 
-from vinemap.compute.processes import die_with_parent
+from vinemap.compute.processes import die_with_parent, python
 from vinemap.errors import VinemapError, WorkerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
 
-SERVE = "import sys; sys.path[:] = sys.argv[1:]; from vinemap.compute.apart import serve; serve()"
+SERVE = "from vinemap.compute.apart import serve; serve()"
 GIVEN, RAISED, DONE = range(3)
 """What an answer is."""
 
@@ -36,8 +35,7 @@ def apart(function: Callable[..., Iterator[Any]], *args: Any) -> Generator[Any]:
     """
     pipe = subprocess.PIPE
     with tempfile.TemporaryFile() as said:
-        command = [sys.executable, "-c", SERVE, *sys.path]
-        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said)  # noqa: S603 - our own
+        process = subprocess.Popen(python(SERVE), stdin=pipe, stdout=pipe, stderr=said)  # noqa: S603 - our own
         try:
             _give(process.stdin, (function, args))
             while True:

@@ -37,6 +37,14 @@ class Outcome(NamedTuple):
     """The last line of its stderr."""
 
 
+def python(code: str, *words: str) -> list[str]:
+    """Command that runs code in another Python, with words as its arguments, which imports from where this one does.
+
+    By itself it would import from the folder in which it is called first, whatever lies there.
+    """
+    return [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {code}", *words]
+
+
 def run_process(command: Sequence[str], *, limit: float | None = None, env: Mapping[str, str] | None = None) -> Outcome:
     """Run a command, kill it after ``limit`` seconds, and measure it; ``env`` is its environment, by default ours."""
     with tempfile.TemporaryFile() as stderr:

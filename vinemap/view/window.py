@@ -11,11 +11,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from vinemap.compute.extras import load
+from vinemap.compute.processes import python
 from vinemap.errors import DependencyError
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ SUN = np.array([-0.5, -0.4, 0.77])
 """Where the light comes from."""
 LONGEST = 300.0
 """Seconds in which a picture must be drawn."""
+DRAW = "from vinemap.view.window import draw; draw()"
+"""What the process of its own runs."""
 
 
 def has_screen() -> bool:
@@ -61,7 +64,7 @@ def show(scene: Scene, png: Path | None = None) -> None:
             np.savez(
                 stream, **scene._replace(rows=[])._asdict(), row_vertices=vertices, row_faces=faces, look=_way(scene)
             )
-        command = [sys.executable, "-m", "vinemap.view.window", str(held), *([str(png)] if png else [])]
+        command = python(DRAW, str(held), *([str(png)] if png else []))
         try:
             most = LONGEST if png else None
             drawn = subprocess.run(command, check=False, capture_output=True, timeout=most)  # noqa: S603 - our own
@@ -74,6 +77,12 @@ def show(scene: Scene, png: Path | None = None) -> None:
         raise DependencyError(
             "Open3D can't draw here: it wants a screen, or for a picture apt-get install libegl1 libgl1"
         )
+
+
+def draw() -> NoReturn:
+    """Be that process: draw what the file of its first argument holds, to that of the second, if there is one."""
+    with np.load(sys.argv[1]) as arrays:
+        sys.exit(not _draw(dict(arrays), sys.argv[2] if len(sys.argv) > 2 else None))
 
 
 def _draw(held: dict[str, Any], png: str | None) -> bool:
@@ -146,8 +155,3 @@ def _way(scene: Scene) -> Any:
     aside = -aside if aside[1] > 0 else aside
     front = np.append(0.5 * aside + 0.8 * np.array([-aside[1], aside[0]]), STEEP)
     return front / np.linalg.norm(front)
-
-
-if __name__ == "__main__":
-    with np.load(sys.argv[1]) as arrays:
-        sys.exit(not _draw(dict(arrays), sys.argv[2] if len(sys.argv) > 2 else None))
