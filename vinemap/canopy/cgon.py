@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 SNAP = 1e-6
 """Share of a section's extent within which a foot that was moved is set on the hull's vertex."""
+FLAT = 1e-12
+"""Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""
 LONGEST = 256
 """An outline of more edges is first simplified from outside: no two edges in a row turn by less than 360°/LONGEST."""
 
@@ -323,7 +325,3 @@ def _enclose_all(
         if len(ring) > 0 and np.isfinite(feet[k, 0] + feet[k, 1] + feet[k, 2]):
             _polygon(ring, feet[k, 0], feet[k, 1], feet[k, 2], slide, polygon[k])
             areas[0, k], areas[1, k], areas[2, k] = area_of(ring), area_of(polygon[k]), shared_area(polygon[k], ring)
-
-
-FLAT = 1e-12
-"""Share of a section's extent below which a vertex of its outline stands on its neighbours' line."""

@@ -34,6 +34,8 @@ WORDS, NUMBERS = ("parcel", "name", "label"), ("code", "id")
 """Columns that are likely to name polygons, the likeliest first, and such as number them."""
 HALF = 0.5
 """Share of the polygons that have a name, from which on the others lack one."""
+USELESS = (9, 0)
+"""Rank of columns that name nothing, or not each polygon."""
 LONGEST_WORD = 31
 """Letters of a name beyond which it may be an identifier that a program gave."""
 OF_KML = {"description", "timestamp", "begin", "end", "altitudemode", "tessellate", "extrude", "visibility"}
@@ -267,9 +269,6 @@ def _read_table(path: Path, *, local: bool = False) -> _Table:
     }
     usable = min(ranks.values(), default=USELESS) < USELESS
     return _Table(frame, area, {name: columns[name] for name in sorted(ranks, key=ranks.__getitem__)}, usable)
-
-
-USELESS = (9, 0)
 
 
 def _rank(column: str, words: pd.Series, *, measured: bool) -> tuple[int, int]:

@@ -113,7 +113,7 @@ def window(grid: Grid, low: ArrayLike, high: ArrayLike, *, multiple: int = 1) ->
 
 def extent(points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Least and greatest coordinates (k,) of points (n, k)."""
-    table = _columns(points)
+    table = _plain(points)
     bounds = np.array(in_threads(lambda part: _bounds(*part, table), stretches(len(table))))
     return bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
 
@@ -126,7 +126,7 @@ def coarser(grid: Grid, *, resolution: float) -> Grid:
 
 def cell_of(xy: NDArray[np.floating], grid: Grid) -> NDArray[np.int32]:
     """Flat index (n,) of the cell that holds each point (n, ≥2); points outside go to the nearest cell."""
-    points = _columns(xy)
+    points = _plain(xy)
     out = np.empty(len(points), dtype=np.int32)
     in_threads(lambda part: _cells(*part, points, grid, out), stretches(len(points)))
     return out
@@ -164,7 +164,7 @@ def block_sum(values: NDArray[np.floating] | NDArray[np.uint16] | NDArray[np.boo
 def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
     """Bilinear values (…,) at points (…, ≥2); beyond the outer cell centres the border's value holds."""
     points = np.asarray(xy, dtype=float)
-    flat = _columns(points.reshape(-1, points.shape[-1]))
+    flat = _plain(points.reshape(-1, points.shape[-1]))
     values, out = np.ascontiguousarray(raster.values), np.empty(len(flat))
     in_threads(lambda part: _bilinear(*part, values, raster.grid, flat, out), stretches(len(flat)))
     return out.reshape(points.shape[:-1])
@@ -172,7 +172,7 @@ def sample(raster: Raster, xy: ArrayLike) -> NDArray[np.float64]:
 
 def above(raster: Raster, xyz: NDArray[np.floating]) -> NDArray[np.float32]:
     """Metres (n,) that points (n, 3) lie above a raster of elevations, as it is sampled."""
-    points, values = _columns(xyz), np.ascontiguousarray(raster.values)
+    points, values = _plain(xyz), np.ascontiguousarray(raster.values)
     out = np.empty(len(points), dtype=np.float32)
     in_threads(lambda part: _above(*part, values, raster.grid, points, out), stretches(len(points)))
     return out
@@ -183,14 +183,14 @@ def sample_across(
 ) -> NDArray[np.float64]:
     """Bilinear values (n, m) at offsets (m,) from origins (n, 2) along unit vectors (n, 2)."""
     values = np.ascontiguousarray(raster.values)
-    starts, ways, at = (_columns(v) for v in (origin, normal, offsets))
+    starts, ways, at = (_plain(v) for v in (origin, normal, offsets))
     out = np.empty((len(origin), len(offsets)))
     in_threads(lambda part: _bilinear_across(*part, values, raster.grid, starts, ways, at, out), stretches(len(origin)))
     return out
 
 
-def _columns(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The same (n, k) as compiled code wants it."""
+def _plain(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The same, of any shape, as compiled code wants it: of double precision, in one piece."""
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
