@@ -132,11 +132,13 @@ def resident(process: int) -> int:
     return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
 
 
-def high_water(*, status: Path = Path("/proc/self/status"), reset: Path = Path("/proc/self/clear_refs")) -> int | None:
+def high_water() -> int | None:
     """Most memory (bytes) that this process has held since the last call; None where the system doesn't tell."""
+    own = Path("/proc/self")
     try:
-        kilobytes = next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        reset.write_text("5")
+        lines = (own / "status").read_text().splitlines()
+        kilobytes = next(line.split()[1] for line in lines if line.startswith("VmHWM"))
+        (own / "clear_refs").write_text("5")
     except (OSError, StopIteration):
         return None
     return int(kilobytes) * 1024

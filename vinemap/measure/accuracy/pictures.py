@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from vinemap.measure.accuracy.rows import Worst
     from vinemap.simulate.survey import Survey
 
+REACH = 3.0
+"""Metres beyond a row's ends, and to both sides, that are drawn."""
+
 
 def draw(worst: Worst | None, survey: Survey, found: RowMap, title: str, path: Path) -> None:
     """Draw a map, and its worst row straightened and at both ends, over the canopy cover."""
@@ -52,19 +55,19 @@ def _draw_plan(axes: Axes, survey: Survey, found: RowMap, width: float) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: RowMap, reach: float = 3.0) -> None:
+def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: RowMap) -> None:
     """Draw what lies along a line, across it exaggerated."""
     xy = shapely.get_coordinates(line.segmentize(0.25))
     for k, other in ((0, 1), (-1, -2)):
         out = (xy[k] - xy[other]) / np.hypot(*(xy[k] - xy[other]))
-        xy = np.insert(xy, 0 if k == 0 else len(xy), xy[k] + reach * out, axis=0)
+        xy = np.insert(xy, 0 if k == 0 else len(xy), xy[k] + REACH * out, axis=0)
     axis = shapely.LineString(xy)
-    s, left = np.arange(0, axis.length, 0.1), np.arange(-reach, reach, 0.05)
+    s, left = np.arange(0, axis.length, 0.1), np.arange(-REACH, REACH, 0.05)
     here, ahead = (shapely.get_coordinates(shapely.line_interpolate_point(axis, s + step)) for step in (0, 0.05))
     way = np.where(np.arange(len(s))[:, None] < len(s) - 1, ahead - here, (ahead - here)[-2])
     normal = np.column_stack([-way[:, 1], way[:, 0]]) / np.hypot(*way.T)[:, None]
     image = sample_across(found.cover, here, normal, left)
-    extent = (-reach, axis.length - reach, -reach, reach)
+    extent = (-REACH, axis.length - REACH, -REACH, REACH)
     axes.imshow(image.T[::-1], extent=extent, aspect="auto", cmap="Greys", vmin=0, vmax=1)
     for rows, colour in ((survey.rows, "tab:green"), (found.rows, "red")):
         for row in shapely.force_2d(rows.geometry.to_numpy()):
@@ -72,8 +75,8 @@ def _draw_along(axes: Axes, line: shapely.LineString, survey: Survey, found: Row
             at = shapely.line_locate_point(axis, shapely.points(points))
             k = np.minimum((at / 0.1).astype(int), len(s) - 1)
             across = np.einsum("ij,ij->i", points - here[k], normal[k])
-            near = (np.abs(across) < reach) & (at > 0) & (at < axis.length)
-            axes.plot(np.where(near, at - reach, np.nan), np.where(near, across, np.nan), color=colour, linewidth=1)
-            ends = np.column_stack([at - reach, across])[[0, -1]][near[[0, -1]]]
+            near = (np.abs(across) < REACH) & (at > 0) & (at < axis.length)
+            axes.plot(np.where(near, at - REACH, np.nan), np.where(near, across, np.nan), color=colour, linewidth=1)
+            ends = np.column_stack([at - REACH, across])[[0, -1]][near[[0, -1]]]
             axes.plot(*ends.T, "|", color=colour, markersize=25)
     axes.set(xlabel="along the row (m)", ylabel="to its left (m)")

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 NEAR = 0.8
 """Metres within which a gap and a dead vine belong together."""
+PLACES = 4000
+"""At which the terrain is asked for, those beside the parcels among them."""
 LONG = 1.5
 """Metres from which a gap is one of missing vines: shorter ones may part bushes that stand apart."""
 
@@ -94,10 +96,11 @@ def pool(errors: Sequence[Errors]) -> Errors:
     return Errors(sum(rows), sum(found), pd.concat(pairs), *(np.concatenate(values) for values in arrays))
 
 
-def _terrain_errors(survey: Survey, dtm: Raster, *, n: int = 4000) -> Floats:
+def _terrain_errors(survey: Survey, dtm: Raster) -> Floats:
+    """Errors (n,) of the terrain's elevation, m, at random places in the parcels."""
     inside = shapely.union_all(survey.parcels.geometry.to_numpy())
     west, south, east, north = inside.bounds
-    x, y = np.random.default_rng(0).uniform([west, south], [east, north], (n, 2)).T
+    x, y = np.random.default_rng(0).uniform([west, south], [east, north], (PLACES, 2)).T
     x, y = np.array([x, y])[:, shapely.contains_xy(inside, x, y)]
     return np.abs(sample(dtm, np.column_stack([x, y])) - survey.terrain(x, y))
 

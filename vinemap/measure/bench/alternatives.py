@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from vinemap.geo.raster import Raster
 
 T = TypeVar("T")
+STEP = 2.0
+"""Metres of a piece of a cluster, of which a line goes through the middle."""
 CANOPY = (0.5, 2.9)
 """Heights (m) above ground between which a point is one of canopy."""
 OUTLINE = 30
@@ -143,17 +145,17 @@ def rows(cloud: str, boundary: str, truth: str, thin: float) -> dict[str, str]:
     }
 
 
-def course(xy: Floats, *, step: float = 2.0) -> shapely.LineString | None:
-    """Line through a cluster (n, 2): the middles of pieces of ``step`` m along its longest axis, None of no length."""
+def course(xy: Floats) -> shapely.LineString | None:
+    """Line through a cluster (n, 2): the middles of pieces of ``STEP`` m along its longest axis, None of no length."""
     import shapely
 
     middle = xy.mean(axis=0)
     axes = np.linalg.svd(np.cov((xy - middle).T))[0]
     along, across = (xy - middle) @ axes.T[0], (xy - middle) @ axes.T[1]
     start, end = along.min(), along.max()
-    if end - start < step:
+    if end - start < STEP:
         return None
-    pieces = max(round((end - start) / step), 1)
+    pieces = max(round((end - start) / STEP), 1)
     piece = np.minimum(((along - start) / (end - start) * pieces).astype(int), pieces - 1)
     kept = np.flatnonzero(np.bincount(piece, minlength=pieces))
     left = (np.bincount(piece, across, pieces)[kept] / np.bincount(piece, minlength=pieces)[kept])[

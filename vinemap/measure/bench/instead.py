@@ -70,17 +70,17 @@ def instead(millions: float, family: str, run: Run, out: Path) -> Lines:
     return lines
 
 
-def whole(measured: Sequence[tuple[float, str, Run]], out: Path, *, limit: float = LIMIT) -> Lines:
+def whole(measured: Sequence[tuple[float, str, Run]], out: Path) -> Lines:
     """Table of the whole job by the best tools there are, and by us: of each survey its size, family and run."""
     lines = [["survey", "with", "takes", "most memory, MB", "rows", "volume of all canopies"]]
     for millions, family, run in measured:
         name = f"{family}, {run.points / 1e6:.1f} M points"
-        lines += [[name, *cells] for cells in _by_others(millions, family, out, limit)]
+        lines += [[name, *cells] for cells in _by_others(millions, family, out)]
         lines.append([name, "vinemap run", f"{run.wall:.1f} s", _memory(run.peak), *_found(run.found)])
     return lines
 
 
-def _by_others(millions: float, family: str, out: Path, limit: float) -> Lines:
+def _by_others(millions: float, family: str, out: Path) -> Lines:
     """What each clustering took and gave."""
     wanted = ("sklearn",) if find_spec("pdal") else ("CSF", "sklearn")
     missing = [module for module in wanted if find_spec(module) is None]
@@ -92,7 +92,7 @@ def _by_others(millions: float, family: str, out: Path, limit: float) -> Lines:
     for clustering in CLUSTERINGS:
         result, rows = (out / "jobs" / f"whole-{family}-{clustering}.{kind}" for kind in ("json", "gpkg"))
         given = {"cloud": survey["cloud"], "boundary": survey["boundary"], "clustering": clustering, "out": str(rows)}
-        outcome = run_process(job("whole", result, **given), limit=limit)
+        outcome = run_process(job("whole", result, **given), limit=LIMIT)
         if outcome.code:
             lines.append([clustering, outcome.said, *["–"] * 3])
             continue
