@@ -88,6 +88,20 @@ def test_shifts_against_the_same_known_rows_tell_that_between_flights(estate):
     assert changes.tell_parcel(later, [earlier], "EPSG:32632")["told"]["shift"] == pytest.approx((0, 0.5))
 
 
+def test_a_fault_of_ours_in_comparing_rows_is_told_with_what_it_says(estate, monkeypatch):
+    def faulty(*args, **options):
+        raise KeyError("d_gap_m")
+
+    later, earlier = (
+        next(one for one in read_products(estate / survey) if one.parcel == "A") for survey in ("fall", "june")
+    )
+    for name in ("history", "compare_rows"):
+        monkeypatch.setattr(changes, name, faulty)
+        remark = changes.tell_parcel(later, [earlier], "EPSG:32632")["told"]["remark"]
+        what = "followed" if name == "history" else "compared"
+        assert remark == f"can't be {what}: a fault of vinemap's own (KeyError: 'd_gap_m')"
+
+
 def details(folder):
     return unpacked(paths.index(folder).read_text(encoding="utf-8"), "details")
 

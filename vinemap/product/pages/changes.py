@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from vinemap.compute.threads import in_threads
+from vinemap.errors import own_fault
 from vinemap.evaluate.changes import GONE, compare_rows, summarise
 from vinemap.geo.crs import WGS84, project
 from vinemap.product.pages.page import mean_of, polylines
@@ -71,7 +72,7 @@ def tell_parcel(product: Product, earlier: Sequence[Product], crs: CRS) -> dict[
         try:
             found["history"] = history(flights, latest=compared.get("all"))
         except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
-            found["told"].setdefault("remark", f"can't be followed ({type(error).__name__})")
+            found["told"].setdefault("remark", f"can't be followed: {own_fault(error)}")
     return found
 
 
@@ -97,7 +98,7 @@ def _compare(
     try:
         changes = compare_rows(rows, earlier, shift=shift_between(product, before))
     except Exception as error:  # noqa: BLE001 - one parcel's odd rows cost no other its place on the page
-        return told | {"remark": f"can't be compared ({type(error).__name__})"}
+        return told | {"remark": f"can't be compared: {own_fault(error)}"}
     table = changes.rows
     columns: dict[str, Any] = {name: table[name].tolist() for name in ("state", "label", "earlier", "part_of")}
     for name, digits in DIGITS.items():
