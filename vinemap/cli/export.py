@@ -58,7 +58,7 @@ def view(products: tuple[Path, ...], cloud: Path | None, png: Path | None) -> No
         raise InputError("There is no screen here: give --png FILE for a picture")
     scene = scene_of(products, cloud)
     if not len(scene.points):
-        click.echo("Rows and meshes without points: give --cloud FILE, or map with product: {classified: true}")
+        click.echo("Rows and meshes without points: give --cloud FILE, or map with --classified (classified: true)")
     show(scene, png)
     if png:
         click.echo(f"→ {png}")
