@@ -1,4 +1,4 @@
-"""Kinds of values that commands take."""
+"""Kinds of values that commands take, and options that are the same of several."""
 
 from __future__ import annotations
 
@@ -57,3 +57,13 @@ class StartParam(click.ParamType):  # type: ignore[type-arg]
                 ctx,
             )
         return check_start(start)
+
+
+CRS = click.option(
+    "--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres."
+)
+ROWS_CRS = click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
+VINES = click.option(
+    "--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats."
+)
+SETTINGS = click.option("--settings", type=FILE, help="YAML file with settings of the stages.")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vinemap.cli.options import FILE, OriginParam
+from vinemap.cli.options import CRS, FILE, ROWS_CRS, SETTINGS, VINES, OriginParam
 from vinemap.terminal import progress
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 @click.option(
     "--rows", type=FILE, help="Known rows, as lines or posts: measured, none sought. The same formats, and DXF."
 )
-@click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
-@click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
-@click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
+@ROWS_CRS
+@VINES
+@CRS
 @click.option("--parcel", help="Name of the parcel; the cloud's by default.")
 @click.option("--out", type=FILE, help="Folder of the product; data/products/<cloud>/<parcel> by default.")
 @click.option("--origin", type=OriginParam(), help="Origin of the local frame {Main}; the parcel's corner by default.")
-@click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+@SETTINGS
 @click.option("--classified", is_flag=True, help="Write the points with a class and a row each, too.")
 @click.option("--plain", is_flag=True, help="Write meshes for readers of glTF that know no extension: larger files.")
 def run(

@@ -9,7 +9,7 @@ import click
 from click.core import ParameterSource
 
 from vinemap.cli.estate import map_configured
-from vinemap.cli.options import FILE, OriginParam
+from vinemap.cli.options import CRS, FILE, ROWS_CRS, SETTINGS, VINES, OriginParam
 from vinemap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,16 +22,16 @@ GIVEN = {ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT}
 @click.argument("clouds", metavar="CLOUD... | NAME", nargs=-1, required=True, type=FILE)
 @click.option("--boundaries", type=FILE, help="Polygons of the parcels of CLOUD, named in one of their columns.")
 @click.option("--rows", type=FILE, help="Known rows, as lines or posts: where there are some, they are measured alone.")
-@click.option("--rows-crs", help="CRS of the known rows and vines, as EPSG:n, where their file states none.")
-@click.option("--vines", type=FILE, help="Known vines, as points: where they stand isn't estimated. The same formats.")
+@ROWS_CRS
+@VINES
 @click.option(
     "--register", "row_register", type=FILE, help="Register of known rows; data/register.gpkg, where that is there."
 )
 @click.option("--parcel", "parcels", multiple=True, help="Name of a parcel, any number of times; all by default.")
-@click.option("--crs", help="CRS of the cloud, as EPSG:n, where it states none or a wrong one; local for local metres.")
+@CRS
 @click.option("--out", type=FILE, help="Folder of the products' folders; data/products/<cloud> by default.")
 @click.option("--origin", type=OriginParam(), help="Origin of the local frame {Main}; each parcel's corner by default.")
-@click.option("--settings", type=FILE, help="YAML file with settings of the stages.")
+@SETTINGS
 @click.option("--again", is_flag=True, help="Map parcels that are up to date, too.")
 @click.option("--workers", type=int, help="Parcels worked at once; as many as there are cores.")
 @click.option("--limit", type=float, help="Seconds that a parcel may take; an hour by default.")
