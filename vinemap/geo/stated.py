@@ -1,4 +1,7 @@
-"""What a LAS file states of its coordinates: their CRS, in WKT or in GeoTIFF keys, and how finely they are stored."""
+"""What a cloud's file states of its coordinates: their CRS, in WKT or in GeoTIFF keys, and how finely they are stored.
+
+It is told as laspy tells it of LAS; what other formats tell is brought to that (:mod:`vinemap.cloud.formats.told`).
+"""
 
 from __future__ import annotations
 
@@ -277,7 +280,7 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: PurePath) -
         Some of n points of the file, evenly.
     n : int
         How many points those are taken from.
-    header : laspy.LasHeader
+    header : laspy.LasHeader or Header
         Of the file.
     crs : CRS
         CRS of the coordinates.
