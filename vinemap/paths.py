@@ -30,6 +30,8 @@ REGISTER = DATA / "register.gpkg"
 """Register of the estate's rows, where nobody names another."""
 OWN_CONFIGURATION = "survey.yaml"
 """File in a survey's folder that says what is otherwise in it."""
+EXPORTS = Path("exports")
+"""Folder of what is exported from products, apart from them, where nobody says otherwise."""
 TRACK = Path("track.gpkg")
 """Track of a robot, where nobody says otherwise."""
 QGIS_PROJECT = "project.qgs"
@@ -198,11 +200,6 @@ def drive_camera(folder: Path) -> Path:
 def track(folder: Path, drive: str) -> Path:
     """GeoPackage of a robot's track."""
     return folder / f"{drive}_track.gpkg"
-
-
-def exports() -> Path:
-    """Folder of what is exported from products, apart from them."""
-    return Path("exports")
 
 
 def table_folder(folder: Path) -> Path:

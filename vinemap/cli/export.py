@@ -38,7 +38,7 @@ def export(products: tuple[Path, ...], formats: tuple[str, ...], out: Path | Non
     from vinemap.export.write import export_products
 
     chosen = FORMATS if "all" in formats else tuple(dict.fromkeys(formats))
-    for line in export_products(products, out or paths.exports(), formats=chosen, **options):
+    for line in export_products(products, out or paths.EXPORTS, formats=chosen, **options):
         click.echo(line)
 
 
