@@ -9,13 +9,35 @@ from pathlib import Path
 
 import pytest
 from drafts import fill, names, publish
+from pyproj import CRS
 from systems import LINUX, POSIX
 
 from vinemap import paths
 from vinemap.config.names import check_name
 from vinemap.errors import OutputError
 from vinemap.naming import LONGEST_NAME, MOST_BYTES
+from vinemap.plugin.install import write_zip
 from vinemap.product import store
+from vinemap.product.geopackage import write_layer
+from vinemap.product.register.file import make_register
+from vinemap.view.window import show
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_layer(None, path, layer="rows"),
+        lambda path: make_register(path, CRS.from_epsg(32632)),
+        write_zip,
+        lambda path: show(None, path),
+    ],
+    ids=["layer", "register", "plugin", "picture"],
+)
+def test_a_file_that_cannot_be_written_is_said_in_a_line(tmp_path, write):
+    (tmp_path / "a").write_text("a file")
+    with pytest.raises(OutputError, match=r"a/b: can't be written \((File exists|Not a directory)\): choose another"):
+        write(tmp_path / "a" / "b")
+    assert names(tmp_path) == ["a"]
 
 
 def test_folder_that_cannot_be_written(tmp_path):

@@ -13,7 +13,7 @@ import platformdirs
 
 from vinemap import __version__, paths
 from vinemap.errors import OutputError
-from vinemap.product.store import unwritable
+from vinemap.product.store import drafted, unwritable
 
 NAME = "vinemap"
 """What QGIS calls the plugin, and its folder."""
@@ -49,16 +49,12 @@ def write_zip(path: Path) -> None:
     """
     if path.exists() and not _is_our_zip(path):
         raise OutputError(f"{path}: is there already, and no plugin of vinemap's: choose another name")
-    draft = path.with_name(f".{path.name}.part")
     try:
-        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as packed:
+        with drafted(path) as draft, zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as packed:
             for name, content in plugin_files().items():
                 packed.writestr(zipfile.ZipInfo(f"{NAME}/{name}", DATE), content, zipfile.ZIP_DEFLATED)
-        draft.replace(path)
     except OSError as error:
         raise unwritable(path, error) from error
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def write_folder(plugins: Path) -> Path:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import pyogrio
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
-from vinemap import paths
 from vinemap.errors import OutputError
 from vinemap.product.layers import LAYERS, Layer, conform
 from vinemap.product.qgis.style import layer_styles
+from vinemap.product.store import drafted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -108,13 +108,10 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     OutputError
         If it can't be written.
     """
-    draft = paths.draft(path, ".gpkg")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _gdal(**WITHOUT_LOCKS):
+        with drafted(path, ".gpkg") as draft, _gdal(**WITHOUT_LOCKS):
             pyogrio.write_dataframe(frame, draft, layer=layer, driver="GPKG", dataset_options={"VERSION": "1.2"})
-        draft.replace(path)
     except (DataSourceError, DataLayerError, FeatureError, OSError) as error:
-        raise OutputError(f"{path}: can't be written ({_reason(error)}): choose another file") from error
-    finally:
-        draft.unlink(missing_ok=True)
+        reason = getattr(error, "strerror", None) or _reason(error)
+        raise OutputError(f"{path}: can't be written ({reason}): choose another file") from error

@@ -167,12 +167,26 @@ def write_whole(path: Path, text: str) -> None:
     OSError
         If it can't be written.
     """
-    draft = paths.draft(path)
-    try:
+    with drafted(path) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def drafted(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Give a file's draft beside it, which takes the file's place if all goes well, and goes if it doesn't.
+
+    Raises
+    ------
+    OSError
+        If it can't take that place.
+    """
+    draft = paths.draft(path, suffix)
+    try:
+        yield draft
         draft.replace(path)
     finally:
-        draft.unlink(missing_ok=True)
+        with suppress(OSError):  # it took it, or was never there
+            draft.unlink()
 
 
 def unwritable(place: Path, error: OSError) -> OutputError:

@@ -18,6 +18,7 @@ import numpy as np
 from vinemap.compute.extras import load
 from vinemap.compute.processes import python
 from vinemap.errors import DependencyError
+from vinemap.product.store import unwritable
 
 if TYPE_CHECKING:
     from vinemap.view.scene import Scene
@@ -51,12 +52,15 @@ def show(scene: Scene, png: Path | None = None) -> None:
     ------
     DependencyError
         If Open3D can draw nothing here.
-    OSError
+    OutputError
         If the picture can't be written.
     """
     if png:
-        png.parent.mkdir(parents=True, exist_ok=True)
-        png.touch()
+        try:
+            png.parent.mkdir(parents=True, exist_ok=True)
+            png.touch()
+        except OSError as error:
+            raise unwritable(png, error) from error
     with tempfile.TemporaryDirectory() as folder:
         held = Path(folder) / "scene"
         with held.open("wb") as stream:

@@ -27,6 +27,7 @@ from vinemap.geo.crs import project
 from vinemap.geo.lines import LAST_NUMBER, ROW_LAYER, as_rows
 from vinemap.product.geopackage import write_geopackage
 from vinemap.product.layers import REAL, TEXT, WHOLE, Layer
+from vinemap.product.store import drafted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -151,17 +152,14 @@ def make_register(path: Path, crs: CRS) -> None:
     if path.exists():
         return
     tables = {name: _empty(layer, crs) for name, layer in REGISTER.items()}
-    draft = paths.draft(path, ".gpkg")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with held(paths.lock_beside(path), f"{path}: another run is at work here", patience=PATIENCE):
             if not path.exists():
-                write_geopackage(tables, draft, contract=REGISTER)
-                draft.rename(path)
+                with drafted(path, ".gpkg") as draft:
+                    write_geopackage(tables, draft, contract=REGISTER)
     except OSError as error:
         raise OutputError(f"{path}: can't be written ({error.strerror or error}): choose another file") from error
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _empty(layer: Layer, crs: CRS) -> gpd.GeoDataFrame:
