@@ -193,7 +193,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_rows(tmp_path / "none.gpkg")
     (tmp_path / "a.dxf").write_text("no drawing")
-    with pytest.raises(InputError, match="can't be read as GeoPackage, GeoJSON, KML, KMZ, DXF or Shapefile"):
+    with pytest.raises(InputError, match=r"KML, KMZ, DXF or Shapefile \(.*file format\)$"):
         read_rows(tmp_path / "a.dxf")
     pyogrio.write_dataframe(pd.DataFrame({"row": [1]}), tmp_path / "table.gpkg")
     with pytest.raises(InputError, match="has no geometry or no CRS"):

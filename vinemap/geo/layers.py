@@ -105,7 +105,7 @@ def read_layers(
     except InputError:
         raise
     except Exception as error:  # GDAL's errors come in several classes
-        reason = reason_of(error)
+        reason = reason_of(error).partition("; It might help")[0].rstrip(".")  # what does isn't an option of ours
         formats = f"GeoPackage, GeoJSON, KML, KMZ{', DXF' if drawn else ''} or Shapefile"
         raise InputError(f"{path}: can't be read as {formats} ({reason})") from error
     nothing = gpd.GeoDataFrame(geometry=[], crs=WGS84 if path.suffix.lower() in KML else None)
