@@ -63,6 +63,8 @@ def test_what_holds_itself(write, text):
 @pytest.mark.parametrize("load", [load_survey, load_estate, load_settings])
 def test_files_that_cannot_be_read(tmp_path, load, monkeypatch):
     with pytest.raises(ConfigError, match="no such file: vinemap config prints such files"):
+        load(tmp_path / "b.yaml")
+    with pytest.raises(ConfigError, match="is a folder: name the file in it"):
         load(tmp_path)
     with pytest.raises(ConfigError, match="can't be read"):
         load(tmp_path / ("x" * 300))

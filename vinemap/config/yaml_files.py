@@ -72,11 +72,13 @@ def read_yaml(path: Path) -> Any:
     """What a YAML file holds; ConfigError if it can't be read."""
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506 - a SafeLoader
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         folder = path.parent if path.parent.is_dir() else Path()
         known = [str(p) for p in sorted(folder.glob("*.yaml"))]
         hint = nearest(str(path), known) if known else "vinemap config prints such files"
         raise ConfigError(f"{path}: no such file: {hint}") from error
+    except IsADirectoryError as error:
+        raise ConfigError(f"{path}: is a folder: name the file in it") from error
     except OSError as error:
         raise ConfigError(f"{path}: can't be read ({error.strerror})") from error
     except Exception as error:  # a YAMLError, or others of tags in odd places
