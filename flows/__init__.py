@@ -14,4 +14,6 @@ os.environ.setdefault("DO_NOT_TRACK", "1")
 # A flow without a server starts one of its own, which takes its time on a busy machine.
 os.environ.setdefault("PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS", "180")
 if "PREFECT_HOME" not in os.environ and not os.access(Path.home(), os.W_OK):
-    os.environ["PREFECT_HOME"] = str(Path(tempfile.gettempdir()) / f"prefect-{os.getuid()}")
+    # Users share the folder of temporary files, but on Windows, which doesn't number them.
+    user = f"-{os.getuid()}" if hasattr(os, "getuid") else ""
+    os.environ["PREFECT_HOME"] = str(Path(tempfile.gettempdir()) / f"prefect{user}")

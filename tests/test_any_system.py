@@ -23,6 +23,7 @@ from vinemap.product.geopackage import write_layer
 
 ROOT = Path(__file__).parents[1]
 HIDING = ROOT / "tests" / "without_posix"
+ASKING = ("hasattr(os", "os.name", "sys.platform", "ON_WINDOWS")
 WORKS = """
 import json, os, sys, warnings
 from pathlib import Path
@@ -60,11 +61,12 @@ def without_posix(code, *args, **environment):
 
 
 def unguarded(source):
-    """What of POSIX a module uses outside of an ``if``, a ``try`` and a ``with suppress(…)``, and which rest it has."""
+    """What of POSIX a module uses without an ``if`` that asks for it, outside of ``try`` and ``with suppress(…)``."""
     found = []
 
     def walk(node):
-        if isinstance(node, (ast.If, ast.Try, ast.With)):
+        asks = isinstance(node, (ast.If, ast.IfExp)) and any(word in ast.unparse(node.test) for word in ASKING)
+        if asks or isinstance(node, (ast.Try, ast.With)):
             return
         for name in [alias.name for alias in node.names] if isinstance(node, (ast.Import, ast.ImportFrom)) else ():
             found.extend({name, getattr(node, "module", None)} & MODULES)
@@ -94,6 +96,11 @@ def test_the_rule_sees_what_only_posix_has():
     assert unguarded("def f():\n    os.sysconf('SC_PAGE_SIZE')\n    with suppress(OSError):\n        os.wait4(1)") == [
         "os.sysconf"
     ]
+
+
+def test_only_an_if_that_asks_for_it_guards_what_posix_has():
+    assert unguarded("if x:\n    os.getuid()") == ["os.getuid"]
+    assert unguarded("if hasattr(os, 'getuid'):\n    os.getuid()\nx = 1 if os.name == 'nt' else os.getuid()") == []
 
 
 def test_folders_locks_and_workers_without_posix(tmp_path):
