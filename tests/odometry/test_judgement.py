@@ -9,7 +9,8 @@ from vinemap.odometry.correlation import Place
 from vinemap.odometry.judgement import ALIKE, Patches, fit_of
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
 from vinemap.odometry.step import estimate_motion
-from vinemap.simulate.camera import LOW, RESOLUTION, above, lay_ground, render
+from vinemap.simulate.camera import LOW, above, lay_ground, render
+from vinemap.simulate.grounds import RESOLUTION
 
 FOCAL = 300.0
 PLACE, CENTRE = Place(3.0, 100.0, 140.0), (120, 160)

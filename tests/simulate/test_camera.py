@@ -7,7 +7,6 @@ from vinemap.odometry.poses import Pose, moved
 from vinemap.simulate.camera import (
     HIGH,
     LOW,
-    RESOLUTION,
     Ground,
     Weather,
     lay_ground,
@@ -16,6 +15,7 @@ from vinemap.simulate.camera import (
     sinusoid,
     wander,
 )
+from vinemap.simulate.grounds import RESOLUTION
 
 CLEAR = Weather(0, 0)
 AHEAD = LOW.model_copy(update={"x_mm": 0.0})

@@ -11,6 +11,7 @@ import numpy as np
 from vinemap.config.camera import Camera
 from vinemap.errors import DependencyError, InputError
 from vinemap.odometry.poses import Pose
+from vinemap.simulate.grounds import MADE, RESOLUTION, noise
 
 if TYPE_CHECKING:
     from vinemap.compute.arrays import Image, Values
@@ -20,10 +21,6 @@ HIGH = Camera(width=1280, height=720, fx=888.8749, fy=888.5340, above_ground_mm=
 """The two cameras of Table 4.1, the size as width × height."""
 PHOTOGRAPHS = ("gravel", "grass", "brick")
 """Public domain (CC0) photographs of scikit-image, 512 × 512 pixels."""
-MADE = ("soil", "asphalt", "concrete")
-"""Grounds that are made of noise."""
-RESOLUTION = 0.4
-"""Millimetres in a pixel of a ground."""
 RAY = 0.3
 """Millimetres of ground between two rays, at most; the high resolution's pixels have one ray each."""
 AMPLITUDE, PERIOD, STEP = 150.0, 3200.0, 61.0
@@ -36,7 +33,7 @@ class Ground(NamedTuple):
     """A piece of ground about the origin, x to the right and y up."""
 
     image: Image
-    """Grey levels (ny, nx), :data:`RESOLUTION` mm apart, the first row at the top."""
+    """Grey levels (ny, nx), :data:`vinemap.simulate.grounds.RESOLUTION` mm apart, the first row at the top."""
     relief: Values | None = None
     """Height above the plane in mm, of the same shape."""
 
@@ -56,7 +53,7 @@ WEATHER = Weather()
 
 
 def lay_ground(ground: str | Path, *, size_mm: tuple[float, float], seed: int = 0) -> Ground:
-    """Ground of one of the names of :data:`PHOTOGRAPHS` and :data:`MADE`, or of a photograph's file, wide and high.
+    """Ground, wide and high, of a name of :data:`PHOTOGRAPHS` or of those that are made, or of a photograph's file.
 
     Photographs are laid as round pieces, each turned and cut at random, so that no place has a copy; where they
     overlap their contrast is kept (Heitz and Neyret 2018, High-performance by-example noise).
@@ -69,7 +66,7 @@ def lay_ground(ground: str | Path, *, size_mm: tuple[float, float], seed: int = 
     rng = np.random.default_rng(seed)
     nx, ny = (round(size / RESOLUTION) for size in size_mm)
     if ground in MADE:
-        values = _made(str(ground), (ny, nx), rng)
+        values = MADE[str(ground)]((ny, nx), rng)
     else:
         photograph = _file(ground) if isinstance(ground, Path) else _photograph(ground)
         values = _pieces(photograph, (ny, nx), rng)
@@ -81,7 +78,7 @@ def rough(ground: Ground, *, amplitude_mm: float, correlation_mm: float, seed: i
     rng = np.random.default_rng(seed)
     coarse = 8
     shape = tuple(n // coarse + 2 for n in ground.image.shape)
-    hills = _noise(shape, correlation_mm / 2 / RESOLUTION / coarse, rng)
+    hills = noise(shape, correlation_mm / 2 / RESOLUTION / coarse, rng)
     hills *= amplitude_mm / np.ptp(hills)
     import cv2
 
@@ -236,25 +233,3 @@ def _pieces(photograph: Values, shape: tuple[int, int], rng: np.random.Generator
     inner = np.s_[PIECE : PIECE + shape[0], PIECE : PIECE + shape[1]]
     out: Values = mean + total[inner] / np.sqrt(squares[inner] + 1e-6)
     return out
-
-
-def _noise(shape: tuple[int, ...], sigma: float, rng: np.random.Generator) -> Values:
-    """Gaussian noise of unit variance, smooth."""
-    import cv2
-
-    values = np.asarray(cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), sigma))
-    out: Values = (values - values.mean()) / values.std()
-    return out
-
-
-def _made(name: str, shape: tuple[int, int], rng: np.random.Generator) -> Values:
-    """Ground of noise: each layer's size of grain in mm, contrast in grey levels, and how sharp its edges are."""
-    layers = {
-        "soil": ((0.5, 9, 1), (1.5, 12, 3), (4.0, 12, 2), (12.0, 8, 1)),
-        "asphalt": ((0.4, 6, 1), (0.8, 10, 4), (2.0, 16, 4)),
-        "concrete": ((0.4, 3, 1), (0.7, 5, 2), (4.0, 3, 1), (25.0, 4, 1)),
-    }[name]
-    values = np.full(shape, 125.0, np.float32)
-    for grain, contrast, edge in layers:
-        values += contrast * np.tanh(edge * _noise(shape, grain / RESOLUTION, rng)) / np.tanh(edge)
-    return values

@@ -10,7 +10,8 @@ import yaml
 
 from vinemap import paths
 from vinemap.odometry.poses import Pose
-from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground, render, sinusoid
+from vinemap.simulate.camera import LOW, PHOTOGRAPHS, lay_ground, render, sinusoid
+from vinemap.simulate.grounds import MADE
 from vinemap.terminal import frame_progress, plain_errors
 
 if TYPE_CHECKING:

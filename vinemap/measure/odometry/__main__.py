@@ -39,7 +39,8 @@ from vinemap.measure.odometry.trials import (
 )
 from vinemap.measure.odometry.troubles import troubles
 from vinemap.measure.tables import as_markdown, as_text, fill
-from vinemap.simulate.camera import LOW, MADE, PHOTOGRAPHS, lay_ground
+from vinemap.simulate.camera import LOW, PHOTOGRAPHS, lay_ground
+from vinemap.simulate.grounds import MADE
 from vinemap.simulate.steps import PATCH, walk
 from vinemap.terminal import plain_errors
 

@@ -12,7 +12,8 @@ from vinemap.odometry.field import MEMORY
 from vinemap.odometry.frames import Frame
 from vinemap.odometry.poses import moved
 from vinemap.odometry.track import follow
-from vinemap.simulate.camera import LOW, RESOLUTION, Ground, Weather, lay_ground, render, rough, wander
+from vinemap.simulate.camera import LOW, Ground, Weather, lay_ground, render, rough, wander
+from vinemap.simulate.grounds import RESOLUTION
 from vinemap.simulate.steps import HILLS, ROOM
 
 if TYPE_CHECKING:
