@@ -43,6 +43,9 @@ PATCH_SCORE, PATCH_SPREAD = 0.6, 3.0
 """Correlation of a patch that agrees, and pixels of fine detail from the others' median that it may lie off."""
 LEAST_PATCHES, FEWEST_PATCHES = 0.4, 3
 """Share and number of patches that must agree."""
+MOST_APART = 0.55
+"""Pixels of fine detail, root mean square, from which on patches disagree across the movement as no ground's do: what
+they share are shadows that move over it."""
 
 MOST_UNSURE = 1.5, np.radians(0.4)
 """Standard deviations in pixels of fine detail and radians of a step from which on the ground isn't flat enough."""
@@ -111,6 +114,8 @@ class Fit(NamedTuple):
     """Pixels, root mean square along an axis, by which they disagree with one movement."""
     rest: float
     """The same if the camera may sink and tilt."""
+    apart: float
+    """Across the movement, where relief moves nothing."""
 
     def corrected(self, place: Place) -> Place:
         """The place of the step that the patches tell."""
@@ -161,9 +166,10 @@ def fit_of(patches: Patches, place: Place, centre: Sequence[float], focal: float
     bent = np.stack([np.column_stack([ahead, leaning]), np.column_stack([aside, 0 * leaning])])
     whole = np.concatenate([rigid, bent], axis=2)
     every, _ = _least_squares(whole, shifts, sd)
-    rest = float(np.sqrt(np.sum((shifts - whole @ every) ** 2) / max(2 * n - 6, 1)))
+    beyond = np.sum((shifts - whole @ every) ** 2, axis=1)
+    rest, apart = float(np.sqrt(beyond.sum() / max(2 * n - 6, 1))), float(np.sqrt(beyond[1] / max(n - 2, 1)))
     slope, spread = every[4:] if parallax else None, float(np.sqrt(squares.mean()))
-    return Fit(moved[:2], float(moved[2]), covariance, float(every[3]), slope, spread, rest)
+    return Fit(moved[:2], float(moved[2]), covariance, float(every[3]), slope, spread, rest, apart)
 
 
 def _least_squares(slopes: Values, values: Values, sd: Values) -> tuple[Values, Values]:
@@ -299,10 +305,11 @@ def doubt(
     turned, *out = at_limits
     *place_sd, turn_sd = np.sqrt(np.diag(fit.covariance)) if fit else (0.0, 0.0)
     crooked = max(place_sd) > MOST_UNSURE[0] * patches.unit or turn_sd > MOST_UNSURE[1]
+    sliding = fit is not None and fit.apart > MOST_APART * patches.unit
     doubts = {
         "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
         "overlap": any(out),
-        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT or not patches.fit,
+        "score": score < LEAST_SCORE or agreement < LEAST_AGREEMENT or not patches.fit or sliding,
         "ambiguous": rival > MOST_RIVAL * agreement,
         "tilt": crooked and fit is not None and fit.rest < PLANE * fit.spread,
         "relief": crooked,
