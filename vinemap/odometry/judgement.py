@@ -43,9 +43,9 @@ PATCH_SCORE, PATCH_SPREAD = 0.6, 3.0
 """Correlation of a patch that agrees, and pixels of fine detail from the others' median that it may lie off."""
 LEAST_PATCHES, FEWEST_PATCHES = 0.4, 3
 """Share and number of patches that must agree."""
-MOST_APART = 0.55
-"""Pixels of fine detail, root mean square, from which on patches disagree across the movement as no ground's do: what
-they share are shadows that move over it."""
+MOST_APART = 0.65
+"""Pixels of fine detail, root mean square, over the mean correlation of patches, from which on they disagree across the
+movement as no ground's do: what they share are shadows that move over it."""
 
 MOST_UNSURE = 1.5, np.radians(0.4)
 """Standard deviations in pixels of fine detail and radians of a step from which on the ground isn't flat enough."""
@@ -305,7 +305,7 @@ def doubt(
     turned, *out = at_limits
     *place_sd, turn_sd = np.sqrt(np.diag(fit.covariance)) if fit else (0.0, 0.0)
     crooked = max(place_sd) > MOST_UNSURE[0] * patches.unit or turn_sd > MOST_UNSURE[1]
-    sliding = fit is not None and fit.apart > MOST_APART * patches.unit
+    sliding = fit is not None and fit.apart > MOST_APART * patches.mean * patches.unit
     doubts = {
         "blur": min(view.sharpness, next_view.sharpness) < LEAST_SHARPNESS * max(view.sharpness, next_view.sharpness),
         "overlap": any(out),
