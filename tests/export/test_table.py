@@ -140,6 +140,12 @@ def test_one_given_twice_counts_once_and_two_of_one_date_are_refused(seasons, tm
     assert not (tmp_path / "out2").exists()
 
 
+def test_a_folder_of_products_means_all_of_them(seasons, tmp_path):
+    (seasons / "fall" / "survey.json").unlink(missing_ok=True)  # as where its parcels were mapped one by one
+    told, _ = export([seasons / "fall"], tmp_path / "out")
+    assert "table: 6 lines" in told
+
+
 def test_a_survey_without_products_is_refused(seasons, tmp_path):
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / "survey.json").write_text("{}")

@@ -77,19 +77,19 @@ def places_of(folder: Path) -> list[Path]:
 
 
 def products_of(given: Path) -> list[Path]:
-    """The products that a path means: of a survey's folder those of its parcels, of any other the path itself.
+    """The products that a path means: of a folder in which there are some, as of a survey, those; else the path itself.
 
     Raises
     ------
     InputError
         If there is none in the survey's folder.
     """
-    if paths.run_record(given).is_file() or not paths.survey_record(given).is_file():
+    if paths.run_record(given).is_file():
         return [given]
     products = places_of(given)
-    if not products:
+    if not products and paths.survey_record(given).is_file():
         raise InputError(f"{naming.shown(given)}: no parcel of this survey was mapped: see its {paths.INDEX}")
-    return products
+    return products or [given]
 
 
 def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
