@@ -8,7 +8,7 @@ from squares import Job
 
 from vinemap import paths
 from vinemap.config.surveys import load_survey
-from vinemap.errors import InputError
+from vinemap.errors import ConfigError, InputError
 from vinemap.jobs import configured
 from vinemap.jobs.configured import chosen, map_one, products_folder
 
@@ -40,6 +40,12 @@ def test_products_lie_in_the_estates_folder_whoever_maps(here, monkeypatch):
     big = here.folder.parent / "disk" / "products" / "may"
     assert chosen("may")[1].absolute() == big
     assert mapped(monkeypatch, "may", "B")[1].absolute() == big / "B"
+
+
+def test_a_survey_that_is_not_there_is_said_where_none_has_arrived_yet(here):
+    paths.ESTATE.write_text(json.dumps({"surveys": "in"}))
+    with pytest.raises(ConfigError, match=r"june\.yaml: no such file, and nothing of that name in in"):
+        chosen("june")
 
 
 def test_one_parcel_is_made_of_what_it_is_made_of_in_a_survey(here, monkeypatch):

@@ -32,7 +32,7 @@ def chosen(survey: str) -> tuple[SurveyConfig, Path]:
         config = load_survey(path)
         return config, products_folder(config.survey)
     estate = load_estate(paths.ESTATE)
-    found = {arrival.name: arrival for arrival in arrivals(estate)}
+    found = {arrival.name: arrival for arrival in arrivals(estate)} if estate.surveys.exists() else {}
     if survey not in found:
         raise ConfigError(f"{path}: no such file, and nothing of that name in {estate.surveys}")
     arrival = found[survey]
