@@ -4,6 +4,7 @@ import json
 import math
 from xml.etree import ElementTree as ET
 
+import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
@@ -12,8 +13,11 @@ from pyproj import Transformer
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from vinemap.export.field import Field
 from vinemap.export.lanes import lanes_between
+from vinemap.export.opennav_coverage import write_opennav_coverage
 from vinemap.export.write import export_products
+from vinemap.geo.main import Corner
 
 GML = "{http://www.opengis.net/gml}"
 
@@ -116,3 +120,19 @@ def test_robots_in_the_grid_and_another_frame_and_without_headland(tmp_path, pro
     _, edges = graph(tmp_path / NAME / "nav2" / f"{NAME}_graph.geojson")
     assert {edge["metadata"]["class"] for edge in edges.values()} == {"lane"}
     assert_same(lines, rows[rows["block"] == 2].geometry, within=0.05)
+
+
+def test_opennav_coverage_of_rows_that_are_numbered_and_drawn_anyhow(tmp_path):
+    x = np.array([0, 2.5, 5, 7.5])
+    ways = [[(at, 0, 0), (at + lean, 40, 0)] for at, lean in zip(x, (0.1, -0.1, 0.1, -0.1), strict=True)]
+    drawn = [shapely.LineString(way if k % 2 else way[::-1]) for k, way in enumerate(ways)]
+    rows = gpd.GeoDataFrame({"row_id": [1, 4, 2, 3], "block": 1, "spacing_m": 2.5}, geometry=drawn, crs=UTM)
+    rows = rows.sort_values("row_id", ignore_index=True)
+    outline = gpd.GeoDataFrame(geometry=[shapely.union_all(drawn).buffer(2)], crs=UTM)
+    rest = {"folder": tmp_path, "parcel": "A", "survey": "A", "flown": "2026-06-01", "key": "", "outline": outline}
+    lanes = lanes_between(rows)
+    field = Field(**rest, origin=Corner(0, 0, 0), rows=rows, lanes=lanes, row_ends=rows, gaps=rows, bounded=True)
+    write_opennav_coverage(field, tmp_path, frame="map", grid=True, vertices=None)
+    for kind, middles in (("rows", x), ("lanes", x[:-1] + 1.25)):
+        _, lines = field_of(tmp_path / f"A_{kind}.xml", "map")
+        assert [line[:, 0].mean() for line in lines] == pytest.approx(middles, abs=0.1)

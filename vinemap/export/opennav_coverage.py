@@ -16,6 +16,8 @@ import shapely
 from vinemap import paths
 from vinemap.errors import InputError
 from vinemap.export.lanes import resampled
+from vinemap.export.neighbours import aligned
+from vinemap.rows.numbers import order_across
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,8 +33,9 @@ def write_opennav_coverage(field: Field, folder: Path, *, frame: str, grid: bool
     """Write a file of the rows of each block, and one of its lanes, for the server's ``gml_field``.
 
     Lanes are for mode ``ROWSARESWATHS``: the robot drives on them. Rows are for ``CENTER`` and ``OFFSET``, in which the
-    server itself takes the middle between the vertices of two rows. Either way it goes by the order of the ids, from 1,
-    and would take the last row of a block and the first of the next for neighbours, hence a file a block.
+    server itself takes the middle between the vertices of two rows, so all run in one direction. Either way it goes by
+    the order of the ids, from 1, which is that across the rows, whatever their numbers are; and it would take the last
+    row of a block and the first of the next for neighbours, hence a file a block.
 
     Parameters
     ----------
@@ -63,7 +66,8 @@ def write_opennav_coverage(field: Field, folder: Path, *, frame: str, grid: bool
             if len(layer) < 2:
                 continue
             number = vertices or int(np.ceil(layer.length.max() / STEP)) + 1
-            lines = resampled(list(field.plane(layer, grid=grid).geometry), number)
+            curves = aligned(field.plane(layer.iloc[order_across(layer)], grid=grid))
+            lines = resampled([shapely.LineString(curve[:, :2]) for curve in curves], number)
             document = _document(name, polygons, lines, frame)
             path = paths.exported(folder, field.parcel, of + kind, ".xml")
             document.write(path, encoding="unicode", xml_declaration=True)

@@ -45,7 +45,7 @@ def number_rows(rows: gpd.GeoDataFrame, gaps: gpd.GeoDataFrame) -> tuple[gpd.Geo
     lines = [shapely.reverse(g) if b else g for g, b in zip(rows.geometry, backwards, strict=True)]
     rows = rows.set_geometry(gpd.GeoSeries(lines, index=rows.index, crs=rows.crs))
     rank = np.empty(len(rows), dtype=np.int64)
-    rank[_order_across(rows)] = np.arange(1, len(rows) + 1)
+    rank[order_across(rows)] = np.arange(1, len(rows) + 1)
 
     index = gaps["row"].to_numpy(dtype=np.int64)
     turned = backwards[index]
@@ -67,8 +67,8 @@ def _chord(line: shapely.LineString) -> Floats:
     return out
 
 
-def _order_across(rows: gpd.GeoDataFrame) -> Ints:
-    """Positions of rows in the order of their numbers."""
+def order_across(rows: gpd.GeoDataFrame) -> Ints:
+    """Positions of rows, or lanes, block by block and across each as :func:`number_rows` goes."""
     lines = rows.geometry.to_numpy()
     middle = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
     angle = np.array([np.arctan2(*_chord(line)[::-1]) for line in lines])
