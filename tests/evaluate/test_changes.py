@@ -1,5 +1,7 @@
 """Rows of two dates, whose changes are known."""
 
+from itertools import pairwise
+
 import geopandas as gpd
 import numpy as np
 import pytest
@@ -89,6 +91,24 @@ def test_a_replanted_parcel_has_no_row_in_common():
     changes = compare_rows(table(rows_of(6, azimuth=90)), table(rows_of(6, azimuth=0)))
     assert set(changes.rows["state"]) == {"new", "gone"}
     assert len(changes.rows) == 12
+
+
+@pytest.mark.parametrize("spacing", [1.8, 2.2, 2.8])
+@pytest.mark.parametrize("told", [None, (0.0, 0.0)])
+def test_a_parcel_replanted_along_its_old_rows_has_none_in_common(spacing, told):
+    later, earlier = table(rows_of(18, spacing=spacing), wander=0.01), table(rows_of(18), wander=0.01)
+    changes = compare_rows(later.assign(spacing_m=spacing), earlier, shift=told)
+    assert (changes.rows["state"] != "same").all()
+    assert len(changes.rows) == 36
+
+
+def test_rows_between_others_and_a_stretched_flight_leave_rows_the_same():
+    rows = rows_of(18)
+    between = [*rows, *(0.5 * (a + b) for a, b in pairwise(rows))]
+    stretched = [line + 0.02 * (line - np.mean(rows, axis=(0, 1))) for line in rows]
+    for later, earlier, same in ((between, rows, 18), (rows, between, 18), (stretched, rows, 18)):
+        found = summarise(compare_rows(table(later, wander=0.01), table(earlier, wander=0.01)))
+        assert found["same"] == same
 
 
 @pytest.mark.parametrize(("later", "earlier"), [(0, 0), (3, 0), (0, 3), (1, 1)])

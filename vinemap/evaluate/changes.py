@@ -49,7 +49,7 @@ class Changes(NamedTuple):
     """Rows of two dates."""
 
     shift: tuple[float, float]
-    """Metres to the east and north by which the later survey lies off the earlier one."""
+    """Metres to the east and north by which the later survey lies off the earlier one; 0 where other rows stand."""
     rows: pd.DataFrame
     """A line a row of the later date, then those that are gone: ``state`` ("same", "new", "gone"), ``label`` and
     ``earlier`` (its label at that date), ``place`` and ``earlier_place`` (positions in the tables, -1 for none),
@@ -67,6 +67,8 @@ def compare_rows(
     width: float = 0.6,
 ) -> Changes:
     """Match the rows of two dates one to one, and tell what has changed.
+
+    None is the same where a parcel was planted anew at another spacing, and some rows stand where others did by chance.
 
     Parameters
     ----------
@@ -88,6 +90,9 @@ def compare_rows(
     told = estimate_shift(lines, before, spacing=spacing, overlap=overlap, width=near) if shift is None else shift
     moved = _move(lines, -np.asarray(told))
     j, i = match_rows(moved, before, overlap=overlap, width=near).T
+    if _interleaved(moved, before, j, i, spacing=spacing, near=near):
+        j, i = j[:0], i[:0]
+        told = shift or (0.0, 0.0)
     was = np.full(len(lines), NONE)
     was[j] = i
     lost = np.setdiff1d(np.arange(len(before)), i)
@@ -181,15 +186,40 @@ def lie_aside(lines: Lines, before: Lines, *, spacing: float) -> NDArray[np.floa
     if len(lines) == 0:
         return np.zeros(0)
     lines, before = shapely.force_2d(lines), shapely.force_2d(before)
-    moved = _move(lines, -estimate_shift(lines, before, spacing=spacing, width=spacing / 2))
-    places = shapely.line_interpolate_point(moved[:, None], [[0.25, 0.5, 0.75]], normalized=True)
-    off: NDArray[np.float64] = np.median(shapely.distance(places, before[:, None]), axis=1)
-    return off
+    return _off(_move(lines, -estimate_shift(lines, before, spacing=spacing, width=spacing / 2)), before)
 
 
 def are_others(off: NDArray[np.float64], *, spacing: float) -> bool:
     """Whether rows that lie so many metres (n,) aside, each another way, are of another planting."""
     return len(off) >= FEWEST and float(np.mean(off > ASIDE * spacing)) >= MANY
+
+
+def _interleaved(
+    lines: Lines,
+    before: Lines,
+    j: NDArray[np.intp],
+    i: NDArray[np.intp],
+    *,
+    spacing: float,
+    near: float,
+) -> bool:
+    """Whether rows stand among earlier ones at another spacing: many pairs lie aside, and many rows between two."""
+    aside = _off(lines[j], before[i]) > ASIDE * spacing
+    if len(aside) == 0 or np.mean(aside) < MANY:
+        return False
+    for rows, others, paired in ((lines, before, j), (before, lines, i)):
+        off = _off(rows, np.array([shapely.multilinestrings(others)]))
+        between = np.count_nonzero((np.delete(off, paired) > near) & (np.delete(off, paired) < spacing / 2))
+        if len(paired) + between >= FEWEST and between >= MANY * (len(paired) + between):
+            return True
+    return False
+
+
+def _off(lines: Lines, others: Lines) -> NDArray[np.float64]:
+    """Metres (n,) by which lines (n,) lie off others (n,), or off one of any."""
+    places = shapely.line_interpolate_point(lines[:, None], [[0.25, 0.5, 0.75]], normalized=True)
+    off: NDArray[np.float64] = np.median(shapely.distance(places, others[:, None]), axis=1)
+    return off
 
 
 def summarise(changes: Changes) -> dict[str, float]:
