@@ -54,8 +54,8 @@ def serve(
     entrypoint: str,
     *,
     parameters: dict[str, Any],
-    cron: str = "0 2 * * *",
-    timezone: str = "Europe/Rome",
+    cron: str,
+    timezone: str,
     every: float | None = None,
 ) -> None:
     """Run a flow on a schedule until a signal comes, on a server of our own unless ``PREFECT_API_URL`` has one.

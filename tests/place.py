@@ -20,7 +20,7 @@ import json, sys
 from flows.serving import serve
 from vinemap.terminal import plain_errors
 with plain_errors():
-    serve("job.job", **json.loads(sys.argv[1]))
+    serve("job.job", **{"cron": "0 2 * * *", "timezone": "Europe/Rome"} | json.loads(sys.argv[1]))
 """
 
 

@@ -11,6 +11,7 @@ from commands import ROOT, assert_refused, free_of_prefect, python
 from drives import images, poses
 from place import Place
 
+from vinemap.config.surveys import load_estate
 from vinemap.simulate.camera import LOW
 from vinemap.simulate.survey import write_survey
 from vinemap.stages import STAGES
@@ -258,3 +259,9 @@ def test_prefect_yaml_names_no_machine():
     assert "/home" not in text
     (deployment,) = yaml.safe_load(text)["deployments"]
     assert (ROOT / deployment["entrypoint"].split(":")[0]).is_file()
+
+
+def test_prefect_yaml_has_the_schedule_of_the_estate():
+    (deployment,) = yaml.safe_load((ROOT / "prefect.yaml").read_text(encoding="utf-8"))["deployments"]
+    estate = load_estate(ROOT / deployment["parameters"]["config"])
+    assert deployment["schedules"] == [{"cron": estate.cron, "timezone": estate.timezone}]
