@@ -92,12 +92,26 @@ def test_dep_is_3d_where_both_have_z():
     assert both.pairs["dep_m"].tolist() == pytest.approx([0.5, 0])
 
 
-def test_parts_are_joined_or_the_longest_counts():
+def test_parts_are_joined_where_they_follow_each_other():
     parts = [line((0, 0), (30, 0)), line((100, 0), (30, 0))]
     assert only(frame(MultiLineString(parts)))["dep_m"] == pytest.approx(0)
-    broken = MultiLineString([line((0, 0), (5, 0)), line((10, 0), (100, 0))])
-    assert only(frame(broken))["e1_along_m"] == pytest.approx(-10)
+    broken = frame(MultiLineString([line((100, 0, 2), (60, 0, 2)), line((0, 0, 1), (45, 0, 2))]))
+    for pair in (only(broken), only(REFERENCE, broken)):
+        assert pair[["dep_m", "e1_along_m", "en_along_m"]].tolist() == pytest.approx([0, 0, 0])
+    assert only(broken, frame(line((0, 0, 1.5), (100, 0, 2))))["dep_m"] == pytest.approx(0.25)
     assert only(REFERENCE, frame(MultiLineString(parts)))["dep_m"] == pytest.approx(0)
+
+
+def test_parts_side_by_side_are_rows_of_their_own():
+    rows = [line((0, 2.5 * k), (100, 2.5 * k)) for k in range(3)]
+    evaluation = evaluate_rows(frame(*rows), frame(MultiLineString(rows), row=[7]))
+    assert evaluation.pairs["reference"].tolist() == [1, 2, 3]
+    assert len(as_layer(evaluation, frame(*rows), frame(MultiLineString(rows), row=[7]))) == 3
+
+
+def test_lines_elsewhere_are_refused():
+    with pytest.raises(InputError, match="lie 400 m away from the result's: check the parcel"):
+        evaluate_rows(frame(line((500, 0), (600, 0))), REFERENCE)
 
 
 def test_good_extra_missed():

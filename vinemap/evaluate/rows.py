@@ -17,6 +17,7 @@ from shapely.ops import substring
 
 from vinemap.errors import InputError
 from vinemap.geo.crs import horizontal, metric_crs, vertical_unit
+from vinemap.geo.lines import abreast_apart, joined
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,6 +30,8 @@ DEK_STEP = 0.25
 """Spacing, in metres, of the points of the detected curve at which DEK is taken."""
 TANGENT = 1.0
 """Length, in metres, of the reference's last piece that gives its direction at an end."""
+ELSEWHERE = 100.0
+"""Metres between all lines of two tables beyond which they are no one parcel's."""
 
 
 class Spread(NamedTuple):
@@ -109,9 +112,9 @@ def evaluate_rows(
     Parameters
     ----------
     result, reference : GeoDataFrame
-        A line a row, in any CRS, drawn in either direction, with or without z. Of a line in several parts that don't
-        join, the longest counts. Rows are named by a column ``row_id``, ``row`` or ``id`` if it is complete and
-        unique, else by their position from 1.
+        A line a row, in any CRS, drawn in either direction, with or without z. A line in parts is one row where they
+        follow each other, and several where they lie side by side. Rows are named by a column ``row_id``, ``row`` or
+        ``id`` if it is complete and unique, else by their position from 1.
     overlap, width : float
         What counts as a pair, see :func:`match_rows`.
 
@@ -123,12 +126,13 @@ def evaluate_rows(
     Raises
     ------
     InputError
-        If lines have no CRS, or one that doesn't fit their coordinates.
+        If lines have no CRS, or one that doesn't fit their coordinates, or lie elsewhere than those of the other table.
     """
     result, found_ids = _usable(result, "the result")
     reference, truth_ids = _usable(reference, "the reference")
     crs = next((metric_crs(some.crs, *some.total_bounds[:2]) for some in (result, reference) if len(some)), None)
     found, truth = _metric_lines(result, crs), _metric_lines(reference, crs)
+    _check_beside(found, truth)
     j, i = match_rows(found, truth, overlap=overlap, width=width).T
     pairs = pd.DataFrame({"reference": truth_ids[i], "row_id": found_ids[j], **_errors(found[j], truth[i])})
     spreads = (Spread(float(pairs[c].mean()), float(pairs[c].std(ddof=0))) for c in ("dep_m", "dek_m", "cof_m"))
@@ -175,6 +179,7 @@ def format_table(evaluation: Evaluation) -> str:
 
 def _usable(frame: gpd.GeoDataFrame, what: str) -> tuple[gpd.GeoDataFrame, NDArray[np.object_]]:
     """Drop what has no length, and name the rest."""
+    frame = abreast_apart(frame)
     kept = shapely.length(frame.geometry.to_numpy()) > 0
     complete = (name for name in ID_COLUMNS if name in frame and frame[name].notna().all() and frame[name].is_unique)
     column = next(complete, None)
@@ -192,15 +197,19 @@ def _metric_lines(frame: gpd.GeoDataFrame, crs: CRS | None) -> NDArray[np.object
     lines = frame.geometry.set_crs(flat, allow_override=True).to_crs(crs).to_numpy()
     if not np.isfinite(shapely.bounds(lines)).all():
         raise InputError(f"lines don't lie in their CRS, {flat.name}: set the right one in QGIS (Layer > Set CRS)")
-    whole = np.array([_longest(line) for line in lines], dtype=object)
+    whole = np.array([joined(shapely.get_parts(shapely.line_merge(line)).tolist()) for line in lines], dtype=object)
     to_metres = np.array([1.0, 1.0, vertical_unit(frame.crs)])
     return np.asarray(shapely.transform(whole, lambda xyz: xyz * to_metres, include_z=True))
 
 
-def _longest(line: BaseGeometry) -> BaseGeometry:
-    """Join the parts of a line, and take the longest where they don't join."""
-    parts: list[BaseGeometry] = shapely.get_parts(shapely.line_merge(line)).tolist()
-    return max(parts, key=shapely.length)
+def _check_beside(found: NDArray[np.object_], truth: NDArray[np.object_]) -> None:
+    """Refuse lines that are another place's; InputError tells how far off they are."""
+    areas = [shapely.box(*shapely.total_bounds(lines)) for lines in (found, truth) if len(lines)]
+    if len(areas) == 2 and (off := float(shapely.distance(*areas))) > ELSEWHERE:
+        raise InputError(
+            f"the reference's lines lie {off:,.0f} m away from the result's: check the parcel, the reference's CRS, "
+            "and whether its coordinates are swapped"
+        )
 
 
 def _errors(found: NDArray[np.object_], truth: NDArray[np.object_]) -> dict[str, NDArray[np.float64]]:

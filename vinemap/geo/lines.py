@@ -78,8 +78,8 @@ def read_rows(path: Path, *, crs: CRS | None = None, local: bool = False) -> Kno
         If the file can't be read, has no CRS or no row, or more than one layer that may be meant.
     """
     table = read_layers(path, partial(_row_layers, path), "rows", drawn=True, crs=crs, local=local)
-    shapes = [(k, p) for k, s in enumerate(table.geometry) for p in (shapely.get_parts(s) if _are_abreast(s) else [s])]
-    table, lines = table.iloc[[k for k, _ in shapes]].reset_index(drop=True), [_as_row(shape) for _, shape in shapes]
+    table = abreast_apart(table).reset_index(drop=True)
+    lines = [_as_row(shape) for shape in table.geometry]
     if path.suffix.lower() == ".dxf":
         of = table["Layer"].astype(str).where([isinstance(line, shapely.LineString) for line in lines])
         drawn = [Layer(str(path), name, "LineString") for name in dict.fromkeys(of.dropna())]
@@ -130,7 +130,7 @@ def _as_row(shape: BaseGeometry | None) -> Row:
         return "a line of parts side by side" if parts else kind_of(shape)
     if not all(np.isfinite(shapely.get_coordinates(part)).all() for part in parts):
         return "a line with coordinates that are no numbers"
-    line = shapely.remove_repeated_points(_joined(parts))
+    line = shapely.remove_repeated_points(joined(parts))
     if line.length == 0:
         return "a line of no length"
     return line if line.is_simple and not line.is_closed else "a line that crosses itself"
@@ -144,11 +144,19 @@ def _are_abreast(shape: BaseGeometry | None) -> bool:
     return bool(((place > 0) & (place < longest.length) & (parts != longest)).any())
 
 
-def _joined(parts: Sequence[shapely.LineString]) -> shapely.LineString:
+def abreast_apart(table: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """A table of lines in which parts side by side are lines of their own."""
+    shapes = [shapely.get_parts(shape) if _are_abreast(shape) else [shape] for shape in table.geometry]
+    geometry = [part for parts in shapes for part in parts]
+    several = table.iloc[np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])]
+    return several.set_geometry(gpd.GeoSeries(geometry, index=several.index, crs=table.crs))
+
+
+def joined(parts: Sequence[shapely.LineString]) -> shapely.LineString:
     """Parts of a line, one after the other in whatever order they come, in the sense of the first one."""
-    found, *left = (shapely.get_coordinates(part) for part in parts)
+    found, *left = (shapely.get_coordinates(part, include_z=part.has_z) for part in parts)
     while left:
-        ways = [np.hypot(*(xy[e] - found[f])) for xy in left for f, e in ((-1, 0), (-1, -1), (0, 0), (0, -1))]
+        ways = [np.hypot(*(xy[e] - found[f])[:2]) for xy in left for f, e in ((-1, 0), (-1, -1), (0, 0), (0, -1))]
         k, way = divmod(int(np.argmin(ways)), 4)
         xy = left.pop(k)[:: 1 if way in (0, 3) else -1]
         found = np.concatenate([found, xy] if way < 2 else [xy, found])
