@@ -9,7 +9,8 @@ import pyogrio
 import pytest
 import shapely
 
-from vinemap.product.geopackage import write_geopackage
+from vinemap.errors import OutputError
+from vinemap.product.geopackage import write_geopackage, write_layer
 from vinemap.product.layers import LAYERS, conform
 
 CONTRACT = {
@@ -100,3 +101,18 @@ def test_styles_are_what_qgis_looks_for(tmp_path):
 def test_missing_column_is_named():
     with pytest.raises(ValueError, match="rows lacks length_m"):
         conform(table("rows").drop(columns="length_m"), "rows")
+
+
+def test_a_layer_replaces_an_earlier_one_and_nothing_else(tmp_path):
+    pairs, drawn, text = (tmp_path / name for name in ("pairs.gpkg", "drawn.gpkg", "text.gpkg"))
+    lines = gpd.GeoDataFrame(geometry=[shapely.LineString([(0, 0), (9, 9)])], crs=32632)
+    for _ in range(2):
+        write_layer(lines, pairs, layer="pairs")
+    lines.to_file(drawn, layer="reference")
+    lines.to_file(drawn, layer="pairs")
+    text.write_text("notes")
+    for path, why in ((drawn, "holds other layers"), (text, "is there, and isn't a GeoPackage of pairs")):
+        before = path.read_bytes()
+        with pytest.raises(OutputError, match=why):
+            write_layer(lines, path, layer="pairs")
+        assert path.read_bytes() == before

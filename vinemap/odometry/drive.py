@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pyogrio
 import shapely
 
 from vinemap import paths
@@ -24,7 +23,7 @@ from vinemap.odometry.sensors.fixes import read_fixes
 from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import TrackPoint, follow
-from vinemap.product.geopackage import write_geopackage
+from vinemap.product.geopackage import check_replaced, write_geopackage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -277,13 +276,7 @@ def _check_out(out: Path, rows: Path | None) -> None:
         raise OutputError(f"{out}: its folder isn't there: make it first")
     if rows and out.exists() and rows.exists() and out.samefile(rows):
         raise OutputError(f"{out}: holds the rows: choose another file for the track")
-    if out.exists():
-        try:
-            layers = {str(name) for name, _ in pyogrio.list_layers(out)} - {"layer_styles"}
-        except Exception as error:  # GDAL's errors come in several classes
-            raise OutputError(f"{out}: is there, and isn't a track: choose another file") from error
-        if not {"track", "poses"} <= layers <= set(TRACK_LAYERS):
-            raise OutputError(f"{out}: holds other layers ({', '.join(sorted(layers))}): choose another file")
+    check_replaced(out, "a track", known=TRACK_LAYERS, needed=["track", "poses"])
 
 
 def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:

@@ -19,7 +19,7 @@ from vinemap.product.qgis.style import layer_styles
 from vinemap.product.store import drafted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
     import geopandas as gpd
@@ -100,14 +100,34 @@ def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path, contract: 
     pyogrio.write_dataframe(layer_styles(tables), path, layer="layer_styles", driver="GPKG", append=True)
 
 
-def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
-    """Write one layer as a GeoPackage of its own, in place of what was there.
+def check_replaced(path: Path, what: str, *, known: Collection[str], needed: Collection[str]) -> None:
+    """Make sure that a file that is there, if one is, may be replaced.
 
     Raises
     ------
     OutputError
-        If it can't be written.
+        If it isn't ``what`` it is said to be: a GeoPackage with the layers ``needed``, and with none but the ``known``.
     """
+    if not path.exists():
+        return
+    try:
+        with _gdal(**WITHOUT_LOCKS):
+            layers = {str(name) for name, _ in pyogrio.list_layers(path)} - {"layer_styles"}
+    except Exception as error:  # GDAL's errors come in several classes
+        raise OutputError(f"{path}: is there, and isn't {what}: choose another file") from error
+    if not set(needed) <= layers <= set(known):
+        raise OutputError(f"{path}: holds other layers ({', '.join(sorted(layers))}): choose another file")
+
+
+def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
+    """Write one layer as a GeoPackage of its own, in place of an earlier one.
+
+    Raises
+    ------
+    OutputError
+        If it can't be written, or something else is there.
+    """
+    check_replaced(path, f"a GeoPackage of {layer}", known=[layer], needed=[layer])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with drafted(path, ".gpkg") as draft, _gdal(**WITHOUT_LOCKS):
