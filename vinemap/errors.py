@@ -26,7 +26,7 @@ class GridError(InputError):
 
 
 class EmptyError(InputError):
-    """A file has no points that count."""
+    """A file has no points that count, or a product no rows."""
 
 
 class OutsideError(InputError):

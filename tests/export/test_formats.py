@@ -152,6 +152,13 @@ def test_products_without_rows_or_lanes(tmp_path, product):
     assert sorted(path.name for path in (out / NAME).iterdir()) == ["isoxml", "nav2"]
 
 
+def test_products_without_rows_or_lanes_cost_others_nothing(tmp_path, product):
+    none, one = few(product, tmp_path / "none", 0), few(product, tmp_path / "one", 1)
+    with pytest.raises(InputError, match=r"none.*has no row to export; .*one.*no two rows are neighbours"):
+        list(export_products([none, one, product], tmp_path / "out", formats=["geojson", "nav2"]))
+    assert sorted(path.name for path in (tmp_path / "out" / NAME).iterdir()) == ["geojson", "nav2"]
+
+
 @pytest.mark.parametrize("column", ["row_id", "label", "block", "geometry"])
 def test_a_row_drawn_by_hand(tmp_path, product, column):
     drawn = few(product, tmp_path / "drawn", 3)

@@ -12,7 +12,7 @@ import shapely
 from pyogrio.errors import DataLayerError, DataSourceError
 
 from vinemap import naming, paths
-from vinemap.errors import InputError
+from vinemap.errors import EmptyError, InputError
 from vinemap.export.lanes import lanes_between
 from vinemap.geo.crs import WGS84, is_local
 from vinemap.geo.main import Corner, Origin, origin_of, to_main
@@ -124,23 +124,24 @@ def read_field(product: Path, *, lines: str, headland: float, outer: bool, verti
 
     Raises
     ------
+    EmptyError
+        If it has no row, or no lane where one is wanted.
     InputError
-        If it is no whole product, or has no row, or one without number, name, block or line, or no lane where one is
-        wanted.
+        If it is no whole product, or has a row without number, name, block or line.
     """
     folder, record = read_record(product)
     parcel, origin = record["parcel"], origin_of(record["origin"])
     path = paths.geopackage(folder, parcel)
     rows, layers = read_layers(path, ("row_ends", "gaps", "parcel"))
     if len(rows) == 0:
-        raise InputError(f"{naming.shown(path)}: has no row to export")
+        raise EmptyError(f"{naming.shown(path)}: has no row to export")
     rows = rows.sort_values("row_id", ignore_index=True)
     bounded = bool(record.get("bounded"))
     within = shapely.union_all(layers["parcel"].geometry.to_numpy()) if bounded else None
     between = rows if lines != "rows" else rows[:0]
     lanes = lanes_between(between, within, headland=headland, outer=outer, vertices=vertices)
     if lines != "rows" and len(lanes) == 0:
-        raise InputError(
+        raise EmptyError(
             f"{naming.shown(path)}: no two rows are neighbours, so there is no lane: ask for --outer, or --lines rows"
         )
     known: dict[str, Any] = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
 from vinemap import __version__, naming, paths
-from vinemap.errors import InputError, reason_of
+from vinemap.errors import EmptyError, InputError, reason_of
 from vinemap.export import MESHES, TABLE
 from vinemap.export.agopengps import write_agopengps
 from vinemap.export.field import read_field
@@ -44,7 +44,8 @@ def export_products(
 ) -> Iterator[str]:
     """Write products into ``out/<parcel>/<format>``, each whole or not at all, and say so in a line for each parcel.
 
-    The table of all of them goes into ``out/table``. An earlier export is replaced; other files in its folder stay.
+    The table of all of them goes into ``out/table``. An earlier export is replaced; other files in its folder stay. One
+    of several that has nothing to export costs the others nothing: it is named at the end.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def export_products(
     Raises
     ------
     InputError
-        If one is no product, has nothing to export, or bears the name of another.
+        If one is no product, or bears the name of another; at the end, if one has nothing to export.
     OutputError
         If nothing can be written there.
     """
@@ -74,7 +75,14 @@ def export_products(
     of_parcels = [kind for kind in formats if kind != TABLE]
     wanted = lines if set(of_parcels) - set(MESHES) else "rows"
     drawn: dict[str, Any] = {"headland": headland, "outer": outer, "vertices": vertices}
-    fields = [read_field(product, lines=wanted, **drawn) for product in products] if of_parcels else []
+    fields, empty = [], []
+    for product in products if of_parcels else ():
+        try:
+            fields.append(read_field(product, lines=wanted, **drawn))
+        except EmptyError as error:
+            empty.append(str(error))
+    if empty and not fields:
+        raise InputError("; ".join(empty))
     names = [naming.safe(field.parcel) for field in fields]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
@@ -107,6 +115,8 @@ def export_products(
         record = {"vinemap": __version__, "format": TABLE, "products": tables.products}
         _write_whole(target, partial(write_tables, tables), record)
         yield f"{tables.told()} → {naming.shown(target)}"
+    if empty:
+        raise InputError("; ".join(empty))
 
 
 def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, Any]) -> None:
