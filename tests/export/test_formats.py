@@ -159,11 +159,14 @@ def test_products_without_rows_or_lanes_cost_others_nothing(tmp_path, product):
     assert sorted(path.name for path in (tmp_path / "out" / NAME).iterdir()) == ["geojson", "nav2"]
 
 
-@pytest.mark.parametrize("column", ["row_id", "label", "block", "geometry"])
-def test_a_row_drawn_by_hand(tmp_path, product, column):
+@pytest.mark.parametrize(
+    ("column", "drawn_as"),
+    [("row_id", None), ("label", None), ("block", None), ("geometry", None), ("geometry", shapely.LineString())],
+)
+def test_a_row_drawn_by_hand(tmp_path, product, column, drawn_as):
     drawn = few(product, tmp_path / "drawn", 3)
     rows = pyogrio.read_dataframe(drawn / f"{NAME}.gpkg", layer="rows").astype({"row_id": "Int64", "block": "Int64"})
-    rows.loc[1, column] = None
+    rows.loc[1, column] = drawn_as
     pyogrio.write_dataframe(rows, drawn / f"{NAME}.gpkg", layer="rows", geometry_type="LineString Z")
     for format_ in ("geojson", "table"):
         with pytest.raises(InputError, match=rf"{NAME}\.gpkg: row with fid 2 has no {column}: fill that in, or delete"):

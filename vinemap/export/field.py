@@ -111,7 +111,8 @@ def read_layers(
     except (DataSourceError, DataLayerError) as error:
         raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
     for column in ("row_id", "label", "block", "geometry"):
-        if (lacking := rows[column].isna()).any():
+        lacking = rows[column].isna() | (rows.is_empty if column == "geometry" else False)
+        if lacking.any():
             raise InputError(
                 f"{naming.shown(path)}: row with fid {lacking.idxmax()} has no {column}: fill that in, or delete the "
                 "row, or map the parcel with it among known rows (--rows)"
