@@ -112,6 +112,15 @@ def test_vines_come_where_there_are_some(seasons, tmp_path):
     assert names == ["rows", "vines"]
 
 
+def test_rows_whose_ends_have_changed_places_are_told(tmp_path):
+    for survey, flown, turned in (("june", JUNE, (1,)), ("fall", SEPTEMBER, ())):
+        rows = [shapely.reverse(line) if k in turned else line for k, line in enumerate(lines(range(4)))]
+        place_product(tmp_path / survey, "A", rows, survey=survey, flown=flown)
+    _, folder = export([tmp_path / survey / "A" for survey in ("june", "fall")], tmp_path / "out")
+    table = pd.read_csv(folder / "rows.csv")
+    assert table.loc[table["turned"] == 1, ["survey", "row"]].to_numpy().tolist() == [["june", "2 A"]]
+
+
 def test_parquet_holds_the_same_with_units(seasons, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow: pip install 'vinemap[parquet]'")
     _, folder = export([seasons / "fall"], tmp_path / "out")

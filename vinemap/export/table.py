@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
+import shapely
 
 from vinemap import naming, paths
 from vinemap.compute.threads import in_threads
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
+
+    from vinemap.compute.arrays import Floats
 
 DATE = "date"
 
@@ -59,6 +62,7 @@ KEYS = {
         "The vine row itself, the same on all dates: its label at the last of them, with a date where it is gone since"
     ),
     "label": _text("Number of the row and name of the parcel at that date"),
+    "turned": _whole("1 where e1, from which vines are counted, is the other end than at the row's last date, else 0"),
 }
 """What tells lines from one another."""
 ROWS = KEYS | {
@@ -160,11 +164,11 @@ def read_tables(products: Sequence[Path]) -> Tables:
     groups += [[one] for one in read if not one.place]
     parts: dict[str, list[pd.DataFrame]] = {"rows": [], "vines": []}
     for flights, named in zip(groups, in_threads(_follow, groups), strict=True):
-        for one, row in zip(flights, named, strict=True):
-            labels = one.rows["label"]
-            parts["rows"].append(_lines(one.about, one.rows, row, ROWS))
+        for one, followed in zip(flights, named, strict=True):
+            parts["rows"].append(_lines(one.about, one.rows, followed, ROWS))
             if one.vines is not None:
-                own = one.vines["label"].map(dict(zip(labels, row, strict=True)))
+                own = followed.set_axis(one.rows["label"])
+                own = own[~own.index.duplicated(keep="last")].reindex(one.vines["label"])
                 parts["vines"].append(_lines(one.about, one.vines, own, VINES))
     tables = {name: _sorted(pd.concat(found, ignore_index=True), name) for name, found in parts.items() if found}
     return Tables(tables, sorted((one.about for one in read), key=lambda about: tuple(about.values())))
@@ -192,23 +196,31 @@ def _read(folder: Path, record: dict[str, Any]) -> _Flight:
     return _Flight(about, None if is_local(rows.crs) else read_product(folder), rows, vines)
 
 
-def _follow(flights: Sequence[_Flight]) -> list[list[str]]:
-    """Names of the rows of each flight of a parcel, the latest first, the same where a row is."""
+def _follow(flights: Sequence[_Flight]) -> list[pd.DataFrame]:
+    """For the rows of each flight of a parcel, the latest first, ``row``, the same where a row is, and ``turned``."""
     names: dict[int, str] = {}
+    ways: dict[int, Floats] = {}
     found = []
     places = [one.place for one in flights]
     shifts = [shift_between(places[0], one) if places[0] and one else None for one in places[1:]]
     for one, numbers in zip(flights, follow_rows([one.rows for one in flights], shifts=shifts), strict=True):
         since = "" if one is flights[0] else f" ({one.about['flown']})"
-        for number, label in zip(numbers.tolist(), one.rows["label"], strict=True):
+        lines = one.rows.geometry.to_crs(flights[0].rows.crs)
+        turned = []
+        for number, label, line in zip(numbers.tolist(), one.rows["label"], lines, strict=True):
             names.setdefault(number, f"{label}{since}")
-        found.append([names[number] for number in numbers.tolist()])
+            xy = shapely.get_coordinates(line)
+            turned.append(int((xy[-1] - xy[0]) @ ways.setdefault(number, xy[-1] - xy[0]) < 0))
+        found.append(pd.DataFrame({"row": [names[number] for number in numbers.tolist()], "turned": turned}))
     return found
 
 
-def _lines(about: dict[str, Any], table: gpd.GeoDataFrame, row: Any, columns: dict[str, Column]) -> pd.DataFrame:
+def _lines(
+    about: dict[str, Any], table: gpd.GeoDataFrame, followed: pd.DataFrame, columns: dict[str, Column]
+) -> pd.DataFrame:
     """Lines of a product with the columns of a table; those that it hasn't are empty."""
-    given = {"survey": about["survey"], "date": about["flown"], "parcel": about["parcel"], "row": row}
+    given = {"survey": about["survey"], "date": about["flown"], "parcel": about["parcel"]}
+    given |= {name: followed[name].to_numpy() for name in ("row", "turned")}
     whole = table.drop(columns="geometry").assign(**given).reindex(columns=list(columns))
     for name, column in columns.items():
         if column.kind == REAL:
