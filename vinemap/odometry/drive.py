@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
-from vinemap import paths
 from vinemap.errors import InputError, OutputError
 from vinemap.evaluate.reference import read_lines
 from vinemap.geo.crs import WGS84, metric_crs
@@ -24,6 +23,7 @@ from vinemap.odometry.sensors.wheels import Odometer, read_wheels
 from vinemap.odometry.step import ANGLES
 from vinemap.odometry.track import TrackPoint, follow
 from vinemap.product.geopackage import check_replaced, write_geopackage
+from vinemap.product.store import drafted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -280,12 +280,8 @@ def _check_out(out: Path, rows: Path | None) -> None:
 
 
 def _write(layers: dict[str, gpd.GeoDataFrame], out: Path) -> None:
-    out = out.resolve()
-    draft = paths.draft(out, ".gpkg")
     try:
-        write_geopackage(layers, draft, contract=TRACK_LAYERS)
-        draft.replace(out)
+        with drafted(out.resolve(), ".gpkg") as draft:
+            write_geopackage(layers, draft, contract=TRACK_LAYERS)
     except OSError as error:
         raise OutputError(f"{out}: can't be written ({error.strerror or error}): choose another file") from error
-    finally:
-        draft.unlink(missing_ok=True)
