@@ -173,6 +173,17 @@ def test_a_row_drawn_by_hand(tmp_path, product, column, drawn_as):
             list(export_products([drawn], tmp_path / "out", formats=[format_]))
 
 
+@pytest.mark.parametrize("lost", ["width_m", "spacing_m", "heights"])
+def test_a_product_that_was_saved_anew_without_something(tmp_path, product, lost):
+    saved = few(product, tmp_path / "saved", 3)
+    rows = pyogrio.read_dataframe(saved / f"{NAME}.gpkg", layer="rows")
+    rows = rows.set_geometry(rows.geometry.force_2d()) if lost == "heights" else rows.drop(columns=lost)
+    pyogrio.write_dataframe(rows, saved / f"{NAME}.gpkg", layer="rows")
+    for format_ in ("geojson", "table"):
+        with pytest.raises(InputError, match=f"its rows have no {lost} any more.*: map the parcel again"):
+            list(export_products([saved], tmp_path / "out", formats=[format_]))
+
+
 def test_wrong_products_and_places(tmp_path, product):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=r"file.*can't be written"):

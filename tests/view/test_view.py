@@ -74,6 +74,9 @@ def test_what_cannot_be_shown_is_said_in_a_line(product, tmp_path, monkeypatch):
     said = CliRunner().invoke(commands, ["view", str(folder)]).exception
     assert isinstance(said, InputError)
     assert str(said) == "There is no screen here: give --png FILE for a picture"
+    said = CliRunner().invoke(commands, ["view", str(folder), "--png", str(broken / "A.gpkg")]).exception
+    assert isinstance(said, InputError)
+    assert str(said).endswith("A.gpkg: a picture ends in .png or .jpg: give it such a name")
     monkeypatch.setattr(extras, "import_module", fails)
     said = CliRunner().invoke(commands, ["view", str(folder)]).exception
     assert isinstance(said, DependencyError)

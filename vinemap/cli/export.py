@@ -12,6 +12,9 @@ from vinemap.export import FORMATS, LINES
 if TYPE_CHECKING:
     from pathlib import Path
 
+PICTURES = (".png", ".jpg")
+"""Endings of pictures that Open3D writes."""
+
 
 @click.command(short_help="Write rows, lanes, canopies for other programs.")
 @click.argument("products", metavar="PRODUCT...", nargs=-1, required=True, type=FILE)
@@ -54,6 +57,8 @@ def view(products: tuple[Path, ...], cloud: Path | None, png: Path | None) -> No
     from vinemap.view.window import has_screen, show
 
     load("open3d")
+    if png and png.suffix.lower() not in PICTURES:
+        raise InputError(f"{png}: a picture ends in {' or '.join(PICTURES)}: give it such a name")
     if png is None and not has_screen():
         raise InputError("There is no screen here: give --png FILE for a picture")
     scene = scene_of(products, cloud)

@@ -102,7 +102,8 @@ def read_layers(
     Raises
     ------
     InputError
-        If it can't be read, or has a row without number, name, block or line, as somebody may have drawn one.
+        If it can't be read, lacks a column or heights, as another program may have saved it, or has a row without
+        number, name, block or line, as somebody may have drawn one.
     """
     try:
         rows = pyogrio.read_dataframe(path, layer="rows", fid_as_index=True)
@@ -110,6 +111,13 @@ def read_layers(
         layers = {name: pyogrio.read_dataframe(path, layer=name) for name in (*others, *there)}
     except (DataSourceError, DataLayerError) as error:
         raise InputError(f"{naming.shown(path)}: can't be read ({error}): map the parcel again") from error
+    lost = [column for column in ("row_id", "label", "block", "spacing_m", "width_m") if column not in rows]
+    lost += ["heights"] if len(rows) and not rows.has_z.any() else []
+    if lost:
+        raise InputError(
+            f"{naming.shown(path)}: its rows have no {', '.join(lost)} any more, as saved anew by another program: "
+            "map the parcel again"
+        )
     for column in ("row_id", "label", "block", "geometry"):
         lacking = rows[column].isna() | (rows.is_empty if column == "geometry" else False)
         if lacking.any():
