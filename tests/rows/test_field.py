@@ -157,3 +157,16 @@ def test_a_square_shows_in_any_direction_that_is_prescribed():
         field = estimate_row_field(cover, row_direction=told)
         assert field.square is (told is None)
         assert field.plain.values[30:50, 30:50].min() == 1
+
+
+def test_where_rows_meet_a_hedge_aslant_none_runs_between_their_directions():
+    """Else the ends of rows, one after the other, would hang together along the hedge."""
+    rows, hedge = stripes(0, 2.4), stripes(60, 60.0, width=1.2)
+    x, y = (centres - 1000 for centres in rows.grid.centres())
+    beyond = x - y[:, None] / np.tan(np.radians(60))
+    field = estimate_row_field(Raster(np.where(beyond < -3, rows.values, hedge.values), rows.grid, UTM))
+    directions = field.direction.values[24:-24, 24:-24]
+    directions = directions[field.likelihood.values[24:-24, 24:-24] > 0]
+    off = np.minimum(axial(directions, 0), axial(directions, 60))
+    assert off.max() < 15
+    assert np.count_nonzero(axial(directions, 60) < 15) > 100

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FIELD_RESOLUTION = 0.5
 """Cell size in metres of the rasters of a row field."""
+ALIGNED = 0.87
+"""Cosine of the angle between windows' rows up to which those between them run between."""
 
 
 def estimate_row_field(
@@ -114,11 +116,16 @@ def _resample(peaks: Peaks, plain: Values, grid: Grid, base: Grid, step: float, 
         out: Values = map_coordinates(values, [i, j], order=1, mode="nearest")
         return out
 
-    strength = peaks.strength
-    wave = strength**2 * np.exp(2j * np.nan_to_num(peaks.direction))
-    direction = np.mod(np.degrees(np.angle(at(wave.real) + 1j * at(wave.imag)) / 2), 180)
+    strength, turned, spacings = peaks.strength, np.nan_to_num(peaks.direction), np.nan_to_num(peaks.spacing)
+    wave = strength**2 * np.exp(2j * turned)
+    mean = at(wave.real) + 1j * at(wave.imag)
+    direction = np.mod(np.degrees(np.angle(mean) / 2), 180)
     weight = at(strength**2)
-    spacing = at(strength**2 * np.nan_to_num(peaks.spacing)) / np.maximum(weight, 1e-12)
+    spacing = at(strength**2 * spacings) / np.maximum(weight, 1e-12)
+    # Where blocks meet, or rows a hedge, none runs between their directions.
+    unlike = np.abs(mean) < ALIGNED * weight
+    nearest = _strongest_of_four(strength**2, i[unlike], j[unlike])
+    direction[unlike], spacing[unlike] = np.degrees(turned[nearest]), spacings[nearest]
     reach = 2 * round(NEAR / FIELD_RESOLUTION) + 1
     near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, reach) > LEAST_COVER
     likelihood = np.where(near, at(strength), 0.0)
@@ -133,6 +140,20 @@ def _resample(peaks: Peaks, plain: Values, grid: Grid, base: Grid, step: float, 
         raster(likelihood),
         plain=raster(at(plain)),
     )
+
+
+def _strongest_of_four(weight: Values, i: Values, j: Values) -> tuple[Ints, Ints]:
+    """Rows and columns (n,) of those nodes (my, mx) about places (n,) that weigh most there, as a mean takes them."""
+    my, mx = weight.shape
+    corners = [
+        (np.clip(np.floor(i).astype(int) + a, 0, my - 1), np.clip(np.floor(j).astype(int) + b, 0, mx - 1))
+        for a in (0, 1)
+        for b in (0, 1)
+    ]
+    share = [weight[corner] * (1 - np.abs(i - corner[0])) * (1 - np.abs(j - corner[1])) for corner in corners]
+    most = np.argmax(share, axis=0)
+    row, column = (np.choose(most, list(nodes)) for nodes in zip(*corners, strict=True))
+    return row, column
 
 
 def refine_row_field(field: RowField, rows: gpd.GeoDataFrame) -> RowField:
