@@ -91,6 +91,13 @@ def test_a_row_by_itself_may_be_a_hedge():
     assert 0.5 < alone < 0.8
 
 
+@pytest.mark.parametrize(("stands", "least"), [(0.4, 0.7), (0.15, 0.5)])
+def test_a_row_beside_which_most_of_the_next_is_grubbed_up_is_still_one(stands, least):
+    lines = block(6)
+    lines[1] = lines[1] * [stands, 1]
+    assert judged(lines)["confidence"].min() > least
+
+
 def test_less_speaks_for_what_is_short_bare_or_stands_out_little():
     whole = judged(block(5))["confidence"].iloc[2]
     for worse in ({"contrast": 0.4}, {"support": 0.3}):
