@@ -88,19 +88,19 @@ def map_rows(
     cloud, dtm, chm, seen = step("DTM", map_surfaces, points, settings)
     lines, remarks = (None, []) if known is None else lines_here(known, seen, chm.crs)
     cover, levels = step("Canopy cover", canopy_cover, cloud, chm, lines, **options["cover"])
-    seen = seen.without(levels.crowns, chm.grid)
     field = step("Row field", estimate_row_field, cover, **options["row_field"])
     n_key_points = 0
     if lines is None:
         key_points = step("Key points", detect_key_points, cover, dtm, field, **options["key_points"])
         n_key_points = len(key_points)
-        clusters = step("Clusters", cluster_rows, key_points, cover, chm, high=high, **options["clustering"])
+        clusters = step("Clusters", cluster_rows, key_points, cover, chm, seen, high=high, **options["clustering"])
         courses = step("Curves", trace_rows, clusters, cover, **options["curves"])
         remarks = curtain_remarks(courses)
         del key_points, clusters  # much memory
     else:
         lines, within = space_lines(lines, field), None
         courses = step("Curves", follow_lines, lines, cover, **_how(settings))
+    seen = seen.without(levels.crowns, chm.grid)
     shown = {"cover": cover, "levels": levels, "dtm": dtm, "seen": seen}
     fit: Callable[..., Any] = partial(fit_rows, cloud=cloud, high=high, **shown, **options["fit"])
     rows, gaps = step("Ends and gaps", fit, courses, within=within)

@@ -180,6 +180,13 @@ def test_voids_in_a_cloud_are_no_missing_vines(field):
     assert rows["end"].iloc[5] == pytest.approx(8, abs=0.2)
 
 
+def test_a_void_across_all_rows_is_no_track(field):
+    rows, gaps = field.mapped(without=[shapely.Polygon([(-4, -20), (0, -20), (4, 20), (0, 20)])])
+    assert rows["across"].tolist() == [-7.5, -5, -2.5, 0, 2.5, 5, 7.5]
+    hidden = gaps[gaps["state"] == UNSEEN].groupby("across")["length_m"].sum()
+    assert hidden.to_numpy() == pytest.approx(np.full(7, 4), abs=0.5)
+
+
 def test_vines_beneath_the_crown_of_a_tree_are_not_seen():
     """And none is missing there; three are, in another row."""
     rows = rows_of(7, length=40)

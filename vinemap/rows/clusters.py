@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Ints, Values
     from vinemap.geo.raster import Raster
+    from vinemap.surfaces.seen import Seen
 
 FEW = 2
 """Points of a piece that may be a row's last vine, but no row."""
@@ -37,6 +38,7 @@ def cluster_rows(
     key_points: gpd.GeoDataFrame,
     cover: Raster | None = None,
     chm: Raster | None = None,
+    seen: Seen | None = None,
     *,
     method: str = "pieces",
     along: float = 1.0,
@@ -56,6 +58,8 @@ def cluster_rows(
         Canopy cover 0–1, in which posts show that rows go on where all of them lack vines.
     chm : Raster, optional
         Canopy height in metres, which shows houses between rows.
+    seen : Seen, optional
+        What the cloud shows: a void across rows is no track.
     method : str
         "pieces" as described above; "ellipse" is the thesis's, for comparison: semi-axes of √(3 d) and √(0.5 d)
         metres (Eq. 4) and nothing joined.
@@ -97,7 +101,7 @@ def cluster_rows(
     ends = ends_of(xy, direction, spacing, pieces, position)
     beside = partial(pieces_beside, tree, pieces=own, spacing=spacing[:n])
     pairs = candidates(ends, max_gap, beside, whole=int(own.max()) + 1)
-    rows = join(ends, pairs, tree, track_width=track_width, high=high, cover=cover, chm=chm)[pieces]
+    rows = join(ends, pairs, tree, track_width=track_width, high=high, cover=cover, chm=chm, seen=seen)[pieces]
     held = np.isin(rows, rows[:n])
     return key_points.iloc[points[held]].reset_index(drop=True).assign(cluster=rows[held])
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
+    from vinemap.surfaces.seen import Seen
 
 BEND_LENGTH = 10.0
 """Metres of a piece's end that tell how it bends."""
@@ -134,6 +135,7 @@ def join(
     high: float,
     cover: Raster | None = None,
     chm: Raster | None = None,
+    seen: Seen | None = None,
 ) -> Ints:
     """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2).
 
@@ -148,7 +150,7 @@ def join(
             rows[rows == other] = one
     pairs = pairs[chosen]
     gaps = gaps_between(ends.xy[pairs[:, 0]], ends.xy[pairs[:, 1]], ends.spacing[pairs].mean(axis=1))
-    apart = on_tracks(gaps, tree, track_width=track_width, cover=cover)
+    apart = on_tracks(gaps, tree, track_width=track_width, cover=cover, seen=seen)
     if chm is not None:
         apart |= blocked(gaps, chm, high=high)
     one, other = (pairs[~apart] // 2).T

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Flags, Ints, Values
     from vinemap.geo.raster import Raster
+    from vinemap.surfaces.seen import Seen
 
 FLANK = 4.0
 """Metres before and after a gap in which the rows stand that must end there for it to be a track."""
@@ -74,15 +75,18 @@ def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:
     return Gaps((a + b) / 2, (b - a) / np.maximum(length, 1e-9)[:, None], length, spacing)
 
 
-def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None = None) -> Flags:
+def on_tracks(
+    gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None = None, seen: Seen | None = None
+) -> Flags:
     """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
     Gaps of neighbouring rows that lie side by side are judged as one, those on a line aslant, too. What lies farther
     than half a track from all key points is open ground. They are a track if it leads out of the field on both sides of
     them and through ``MOST`` of its rows, and if no posts stand in it: missing vines of some neighbours may line up,
-    those of all don't, but something may stand on a track.
+    those of all don't, but something may stand on a track. Where nothing was ``seen`` there is a void in the cloud.
     """
-    wide = np.flatnonzero(gaps.length >= track_width)
+    shown = gaps.length if seen is None else _shown(gaps, seen)
+    wide = np.flatnonzero(shown >= track_width)
     out = np.zeros(len(gaps.length), dtype=bool)
     if len(wide) == 0:
         return out
@@ -97,6 +101,16 @@ def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | 
     lanes = [*_lanes(gaps)]
     lanes += [lane for aslant in ASLANT for lane in _lanes(gaps, aslant) if _in_line(gaps, lane, track_width)]
     out[wide[np.concatenate(in_threads(on_track, lanes))]] = True
+    return out
+
+
+def _shown(gaps: Gaps, seen: Seen) -> Values:
+    """Metres (k,) of gaps of which something was seen."""
+    n = np.ceil(gaps.length / STRIDE).astype(int) + 1
+    gap = np.repeat(np.arange(len(n)), n)
+    share = (np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + 0.5) / n[gap] - 0.5
+    places = gaps.middle[gap] + (share * gaps.length[gap])[:, None] * gaps.along[gap]
+    out: Values = gaps.length * np.bincount(gap, seen.at(places), len(n)) / n
     return out
 
 
