@@ -24,8 +24,9 @@ SLACK = 0.02
 """Metres to which rows' courses are needed."""
 UNUSUAL = 1.5
 """Ratio of a distance to the usual one, or its inverse, from which a row isn't beside another as it ought to be."""
-STANDS = 0.2
-"""Share of a row's length along which the next one stands, at least, if its distance is to be the usual one."""
+STANDS, TWICE = 0.2, 0.2
+"""Share of a row's length along which the next one stands at the least, where the one after it is mostly the nearest,
+and by how many of its distances that one is off two of them at the most."""
 STEP = 0.5
 """Metres between the stations at which rows are looked at."""
 REACH = 2.5
@@ -112,8 +113,7 @@ def evidence(
     lines = shapely.simplify(shapely.force_2d(rows.geometry.to_numpy()), SLACK)
     at = _stations(lines)
     beside = _beside(at, rows["block"].to_numpy(), REACH * spacing)
-    usual = _usual(at, beside)
-    usual = np.where(np.isfinite(usual), usual, spacing)
+    usual = np.where(np.isfinite(own := _usual(at, beside)), own, spacing)
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     ridge = sample_across(cover, at.xy, normal, np.arange(-2, 3) * cover.grid.resolution).max(axis=1)
     level = at.median(np.where(ridge >= at.median(ridge)[at.row], ridge, np.nan))
@@ -162,11 +162,11 @@ def _seen_from(xy: Values, tangent: Values, other: Values) -> tuple[Values, Valu
 
 
 def _usual(at: _Stations, beside: _Beside) -> Values:
-    """Metres (rows,) at which the next row mostly runs where it doesn't stop short; NaN where there is none."""
-    nearest = beside.away.min(axis=1)
-    nearest[~np.isfinite(nearest)] = np.nan
+    """Metres (rows,) at which the next row runs mostly, or, if the one after does, where it stands; NaN for none."""
+    nearest = np.where(np.isinf(nearest := beside.away.min(axis=1)), np.nan, nearest)
     least = pd.Series(nearest).groupby(at.row).quantile(STANDS).to_numpy(dtype=float)
-    return at.median(np.where(nearest <= UNUSUAL * least[at.row], nearest, np.nan))
+    mostly = at.median(nearest)
+    return np.where(np.abs(mostly - 2 * least) < TWICE * least, least, mostly)
 
 
 def _accompanied(at: _Stations, beside: _Beside, usual: Values) -> Flags:
@@ -184,9 +184,9 @@ def _crosses(at: _Stations, beside: _Beside, usual: Values) -> Values:
     next_ones = np.where(beside.away < UNUSUAL * usual[at.row][:, None], beside.row, -1)
     before, after = next_ones[: -2 * k], next_ones[2 * k :]
     one_row = (at.row[: -2 * k] == at.row[2 * k :])[:, None]
+    broken = one_row & (before != after) & (before >= 0) & (after >= 0)
     away, then = beside.away[: -2 * k], beside.away[2 * k :]
-    alike = (away < UNUSUAL * then) & (then < UNUSUAL * away)  # else the second one was there before, behind the first
-    broken = one_row & (before != after) & (before >= 0) & (after >= 0) & alike
+    broken &= (away < UNUSUAL * then) & (then < UNUSUAL * away)  # else the other one was there before, behind the first
     none = one_row & (before < 0) & (after < 0)
     seam = np.where(broken.all(axis=1), 1.0, np.where(broken.any(axis=1) & none.any(axis=1), 0.5, 0.0))
     out = np.zeros(len(at.start) - 1)
