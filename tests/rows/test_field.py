@@ -106,6 +106,22 @@ def test_vines_in_a_square_have_rows_in_one_direction(along, length):
     assert np.quantile(axial(other.direction.values[held], rows + 90), 0.95) < 3
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_vines_in_a_quincunx_have_rows_in_one_direction_of_three(seed):
+    """Every other row is set off by half a step; some vines are dead, and none is quite in its place."""
+    rng = np.random.default_rng(seed)
+    row, vine = (places.ravel() for places in np.mgrid[-4:5, -6:7])
+    heads = np.column_stack([2.8 * (vine + row % 2 / 2), 2.5 * row]) + rng.normal(20, 0.1, (len(row), 2))
+    x, y = np.meshgrid(np.arange(0, 40, 0.1), np.arange(0, 40, 0.1))
+    cover = np.zeros(x.shape, dtype=np.float32)
+    for east, north in heads[rng.random(len(heads)) > 0.1]:
+        cover[np.hypot(x - east, y - north) < rng.uniform(0.35, 0.6)] = 1
+    field = estimate_row_field(Raster(cover[::-1], Grid(0.0, 40.0, 0.1, 400, 400), UTM))
+    assert field.square
+    directions = field.direction.values[field.likelihood.values > 0.1]
+    assert max((axial(directions, way) < 5).mean() for way in (0, 60.8, 119.2)) > 0.98
+
+
 @pytest.mark.parametrize("away", [2.0, 3.0, 4.0])
 @pytest.mark.parametrize("weak", [1.0, 0.4])
 def test_a_hedge_across_the_ends_turns_no_row(away, weak):

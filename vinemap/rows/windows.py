@@ -69,7 +69,7 @@ def with_the_grain(peaks: Peaks, second: Peaks, drawn: Grain) -> tuple[Peaks, Pe
 
 
 def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple[Peaks, Flags]:
-    """Give plantings in a square, where two directions are about as good, one a block; tell which windows are theirs.
+    """Give plantings in a square, or a quincunx, where several directions are about as good, one a block; tell where.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
     Only windows whose canopies aren't drawn out along one wave count, and so many of them, as wide as long: beside a
@@ -87,21 +87,14 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
             continue
         waves = [np.concatenate([one[block], other[block]]) for one, other in zip(peaks, second, strict=True)]
         direction, spacing, strength = (values[waves[2] > 0] for values in waves)
-        one = _most_common(direction, strength)
-        turned = turn_between(direction, one) > np.pi / 6
-        if not turned.any():
-            continue
-        two = _most_common(direction[turned], strength[turned])
-        near = [turn_between(direction, way) < NEAR_WAY for way in (one, two)]
-        apart = [float(np.median(spacing[some])) for some in near]
-        even = [some & (np.abs(spacing - usual) < EVEN * usual) for some, usual in zip(near, apart, strict=True)]
-        if min(strength[some].sum() for some in even) < REGULAR * strength.sum() / 2:
+        ways, apart = _ways(direction, spacing, strength)
+        if not ways:
             continue  # the block's edge, or gaps, and no second planting
         square |= block
         i, j = np.nonzero(block)
-        long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in (one, two)]
-        alike = max(apart) < EQUAL * min(apart)
-        chosen = (one, two)[int(np.argmax(long if alike else apart))]
+        long = [float(np.ptp(j * np.cos(way) - i * np.sin(way))) for way in ways]
+        alike = [length if EQUAL * its > max(apart) else 0.0 for length, its in zip(long, apart, strict=True)]
+        chosen = ways[int(np.argmax(alike))]
         around = binary_dilation(block, np.ones((5, 5))) & (peaks.strength > 0)
         mine = around & (turn_between(peaks.direction, chosen) < NEAR_WAY)
         other = around & ~mine & (second.strength > 0) & (turn_between(second.direction, chosen) < NEAR_WAY)
@@ -109,6 +102,32 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
             values[other] = second_values[other]
         _spread(out, mine | other, around & ~mine & ~other)
     return Peaks(*out), square
+
+
+def _ways(direction: Values, spacing: Values, strength: Values) -> tuple[list[float], list[float]]:
+    """Radians of the two directions of a square, or the three of a quincunx, in which waves (n,) are regular; spacings.
+
+    Both are empty where there are none.
+    """
+    ways: list[float] = []
+    apart: list[float] = []
+    held = []
+    left = np.ones(len(direction), dtype=bool)
+    while left.any() and len(ways) < 3:
+        way = _most_common(direction[left], strength[left])
+        near = turn_between(direction, way) < NEAR_WAY
+        usual = float(np.median(spacing[near]))
+        ways, apart = [*ways, way], [*apart, usual]
+        held.append(strength[near & (np.abs(spacing - usual) < EVEN * usual)].sum() / strength.sum())
+        left &= turn_between(direction, way) > np.pi / 6
+        if len(ways) == 2 and min(held) >= REGULAR / 2:
+            return ways, apart
+    if len(ways) < 3 or sum(held) < REGULAR or min(held) < REGULAR / 6:
+        return [], []
+    # Where vines stand in a lattice, two of its waves make up the third.
+    one, two, three = np.exp(1j * np.array(ways)) / apart
+    off = min(abs(one + a * two + b * three) for a in (-1, 1) for b in (-1, 1))
+    return (ways, apart) if off < EVEN / min(apart) else ([], [])
 
 
 def prescribed(waves: Sequence[Peaks], way: float) -> Peaks:

@@ -305,7 +305,7 @@ class RowField:
     spacing: Raster
     likelihood: Raster
     square: bool = False
-    """Whether somewhere two directions were about as good, as where vines are planted in a square."""
+    """Whether somewhere several directions were about as good, as where vines are planted in a square or a quincunx."""
     plain: Raster | None = None
     """How clearly rows show, 0–1, where their wave tells little: a lone row has none, a square two."""
 
