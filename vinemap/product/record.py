@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from vinemap.product.recipe import Recipe
 
 SQUARE = (
-    "plants stand in a square: rows run where they are closer together, or where rows are longer; "
+    "plants stand in a square or a quincunx: rows run where they are closer together, or where rows are longer; "
     "row_field.row_direction prescribes another direction"
 )
 LIBRARIES = ("numpy", "scipy", "laspy", "lazrs", "pyproj", "geopandas", "shapely", "rasterio", "numba", "pygltflib")
