@@ -22,7 +22,8 @@ from vinemap.jobs.register import register_products
 from vinemap.odometry.drive import map_drive
 from vinemap.parcel import map_parcel
 from vinemap.product.register.edits import settle
-from vinemap.product.register.file import Update, read_register, update_register
+from vinemap.product.register.file import read_register, update_register
+from vinemap.product.register.tables import Update
 from vinemap.simulate.camera import LOW
 from vinemap.simulate.survey import write_survey
 

@@ -14,7 +14,8 @@ from vinemap.errors import BusyError, InputError
 from vinemap.jobs.register import register_products
 from vinemap.product.register import file
 from vinemap.product.register.edits import settle
-from vinemap.product.register.file import Update, read_register, update_register
+from vinemap.product.register.file import read_register, update_register
+from vinemap.product.register.tables import Update
 
 LINES = np.array([shapely.LineString([(428000, 4940000 + 3 * k), (428030, 4940001 + 3 * k)]) for k in range(5)])
 

@@ -19,13 +19,8 @@ from vinemap.geo.crs import is_local, parse_crs, project
 from vinemap.geo.layers import some_of
 from vinemap.geo.lines import KnownRows, rows_of
 from vinemap.product.register.edits import Settled, are_lines, number, settle
-from vinemap.product.register.file import (
-    Update,
-    make_register,
-    read_register,
-    stamps_of,
-    update_register,
-)
+from vinemap.product.register.file import make_register, read_register, stamps_of, update_register
+from vinemap.product.register.tables import Update
 from vinemap.product.seasons.products import read_record, read_rows
 
 if TYPE_CHECKING:
@@ -37,7 +32,7 @@ if TYPE_CHECKING:
 
     from vinemap.config.surveys import SurveyConfig
     from vinemap.geo.boundaries import Boundary
-    from vinemap.product.register.file import Register
+    from vinemap.product.register.tables import Register
 
 NEAR = 0.3
 """Share of the spacing within which rows are the same."""

@@ -15,7 +15,7 @@ from vinemap.errors import InputError
 from vinemap.geo.crs import project
 from vinemap.geo.layers import some_of
 from vinemap.geo.lines import INSIDE, LAST_NUMBER
-from vinemap.product.register.file import DATES, HISTORY, REGISTER
+from vinemap.product.register.tables import DATES, HISTORY, REGISTER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Values
     from vinemap.geo.boundaries import Boundary
-    from vinemap.product.register.file import Register
+    from vinemap.product.register.tables import Register
 
 MOVED = 0.02
 """Metres by which a line must lie elsewhere to have been moved: less comes of another CRS."""
