@@ -93,7 +93,8 @@ def _seen_from(xy: Values, tangent: Values, other: Values) -> tuple[Values, Valu
 
 def usually_apart(at: Stations, beside: Beside) -> Values:
     """Metres (rows,) at which the next row runs mostly, or, if the one after does, where it stands; NaN for none."""
-    nearest = np.where((away := beside.away.min(axis=1)) < np.inf, away, np.nan)
+    away = beside.away.min(axis=1)
+    nearest = np.where(np.isfinite(away), away, np.nan)
     least = pd.Series(nearest).groupby(at.row).quantile(STANDS).to_numpy(dtype=float)
     mostly = at.median(nearest)
     return np.where(np.abs(mostly - 2 * least) < TWICE * least, least, mostly)
