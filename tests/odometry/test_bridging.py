@@ -71,6 +71,18 @@ def test_a_gap_is_crossed_by_the_steps_beside_it():
         assert moved(found[k - 1].pose, found[k].pose) == pytest.approx(track[k].motion.movement, abs=1e-6)
 
 
+def test_steps_that_err_are_smoothed():
+    """Where each turn is wrong by a third of a degree, no curve through all of them may be taken."""
+    errors = []
+    for seed in range(12):
+        rng = np.random.default_rng(100 + seed)
+        steps = bends(seed=seed)
+        unsure, _ = tracked([step._replace(heading_deg=step.heading_deg + rng.normal(0, 0.3)) for step in steps])
+        true = np.sum([steps[k].heading_deg for k in range(GAP[0], GAP[-1] + 2)])
+        errors.append(crossed(bridged(unsure)).heading_deg - true)
+    assert np.sqrt(np.mean(np.square(errors))) < 3.3
+
+
 def test_it_is_as_sure_as_it_errs():
     z = []
     for seed in range(40):

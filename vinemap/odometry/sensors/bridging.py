@@ -11,7 +11,6 @@ from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
 from vinemap.odometry.sensors.pulling import Pulled, pulled
@@ -26,10 +25,10 @@ if TYPE_CHECKING:
     from vinemap.odometry.sensors.wheels import Odometer
     from vinemap.odometry.track import TrackPoint
 
-AROUND = 4
+AROUND = 5
 """Steps at either side of a gap, at most, that tell those within."""
-DEGREES = (1, 3)
-"""Of splines through them."""
+DEGREES = (1, 2, 3, 4)
+"""Of polynomials that fit them best."""
 WINDOWS = 1000
 """Stretches as long as a gap that it is held against, at most: the nearest."""
 DIFFERENT = 20
@@ -56,10 +55,10 @@ class _Known(NamedTuple):
 def bridged(track: Sequence[TrackPoint], odometer: Odometer | None = None) -> list[TrackPoint]:
     """A track whose stretches are joined by the likeliest steps across the gaps between them.
 
-    Each part of a step, ahead, to the left and its turn, is that of wheels, or of a spline through the steps beside the
-    gap: of what comes closest to frames over stretches as long that they do tell, and as sure as that. A gap that may
-    come of the robot's own movement is no surer than a guess over its time, as nothing like that was seen. What
-    compares with no other stretch is left as it was. Flags stay.
+    Each part of a step, ahead, to the left and its turn, is that of wheels, or of a polynomial through the steps beside
+    the gap, by least squares: of what comes closest to frames over stretches as long that they do tell, and as sure as
+    that. A gap that may come of the robot's own movement is no surer than a guess over its time, as nothing like that
+    was seen. What compares with no other stretch is left as it was. Flags stay.
 
     Parameters
     ----------
@@ -138,18 +137,24 @@ def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] |
 
 
 def _ways(known: _Known, at: Ints, inside: Ints, beside: Ints) -> Values:
-    """Steps (w, n, m, 3) by wheels and by splines inside stretches behind frames (n,), told by those beside them."""
+    """Steps (w, n, m, 3) inside stretches behind frames (n,), by wheels and by polynomials through those beside them."""
     at = at[:, None]
     ways = [known.driven[at + inside]]
     if beside.min(initial=1) < inside[0] and beside.max(initial=0) > inside[-1]:
         speeds = known.seen[at + beside] / known.seconds[at + beside, None]
         ways += [
-            (make_interp_spline(beside, np.eye(len(beside)), k=degree)(inside) @ speeds)
-            * known.seconds[at + inside, None]
+            (_polynomial(beside, inside, degree) @ speeds) * known.seconds[at + inside, None]
             for degree in DEGREES
             if degree < len(beside)
         ]
     return np.array(ways)
+
+
+def _polynomial(known: Ints, wanted: Ints, degree: int) -> Values:
+    """Weights (m, n) of values at places (n,) that make up, at others (m,), the polynomial that fits them best."""
+    unit = np.ptp(known)
+    out: Values = np.vander(wanted / unit, degree + 1) @ np.linalg.pinv(np.vander(known / unit, degree + 1))
+    return out
 
 
 def _beside(seen: Values, before: int, after: int, around: int) -> Ints:
