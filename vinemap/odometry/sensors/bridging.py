@@ -137,7 +137,7 @@ def _crossing(known: _Known, before: int, after: int) -> tuple[Values, Values] |
 
 
 def _ways(known: _Known, at: Ints, inside: Ints, beside: Ints) -> Values:
-    """Steps (w, n, m, 3) inside stretches behind frames (n,), by wheels and by polynomials through those beside them."""
+    """Steps (w, n, m, 3) in stretches behind frames (n,), by wheels and by polynomials through those beside them."""
     at = at[:, None]
     ways = [known.driven[at + inside]]
     if beside.min(initial=1) < inside[0] and beside.max(initial=0) > inside[-1]:
