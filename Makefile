@@ -65,7 +65,7 @@ accuracy: $(READY) ## Measure rows and canopies on simulated vineyards, fill doc
 fuzz: $(READY) ## Damage small clouds in 2,000 ways: each must end in a right product or in a line: make fuzz [CASES=200]
 	@$(BIN)/python -m vinemap.measure.fuzz $(if $(CASES),--cases $(CASES))
 
-odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=5000]
+odometry: $(READY) ## Measure visual odometry on simulated frames, fill docs/accuracy.md: make odometry [PART="lost paths"] [PAIRS=500]
 	@OMP_NUM_THREADS=1 $(BIN)/python -m vinemap.measure.odometry $(PART) $(if $(PAIRS),--pairs $(PAIRS)) --docs docs/accuracy.md
 
 bench: $(READY_BENCH) ## Measure seconds and memory, fill docs/speed.md: make bench [SIZES="1 2"]
