@@ -208,8 +208,8 @@ def _interleaved(
     if len(aside) == 0 or np.mean(aside) < MANY:
         return False
     for rows, others, paired in ((lines, before, j), (before, lines, i)):
-        off = _off(rows, np.array([shapely.multilinestrings(others)]))
-        between = np.count_nonzero((np.delete(off, paired) > near) & (np.delete(off, paired) < spacing / 2))
+        off = np.delete(_off(rows, np.array([shapely.multilinestrings(others)])), paired)
+        between = np.count_nonzero((off > near) & (off < spacing / 2))
         if len(paired) + between >= FEWEST and between >= MANY * (len(paired) + between):
             return True
     return False
