@@ -156,8 +156,9 @@ def test_paths_and_times_are_held_against_their_bars():
     drift = {method: Drift(np.full(2, place), np.full(2, turn), squared) for method, place, turn in ends}
     assert misses(drift_table(drift)) == ["30!", "0.200!, 0.200"]
     assert drift_table(drift)[0][-1].endswith("(0.6–7.2)")
-    drift["aligned"] = drift["aligned"]._replace(squared=np.array([7.0, 9.0]))
-    assert misses(drift_table(drift))[-1] == "8.00!"
+    for squared in (np.array([7.0, 9.0]), np.array([0.1, 0.9])):
+        drift["aligned"] = drift["aligned"]._replace(squared=squared)
+        assert misses(drift_table(drift))[-1] == f"{squared.mean():.2f}!"
     slow = Size(0.2, {"320 × 240": 0.01, "1280 × 720": 0.05}, 90.0, {})
     assert misses(size_table([slow], 0.02)) == ["10.0!, 9.0"]
     assert misses(size_table([slow._replace(share=0.1)], 0.02)) == []

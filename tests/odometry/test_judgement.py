@@ -6,9 +6,10 @@ import pytest
 from vinemap.measure.odometry.trials import template_error
 from vinemap.measure.odometry.troubles import TROUBLES, drive
 from vinemap.odometry.correlation import Place
-from vinemap.odometry.judgement import ALIKE, Patches, fit_of
+from vinemap.odometry.judgement import ALIKE, Patches, fit_of, patches_at
 from vinemap.odometry.poses import Pose, moved, onward, onward_covariance
 from vinemap.odometry.step import estimate_motion
+from vinemap.odometry.views import view_of
 from vinemap.simulate.camera import LOW, above, lay_ground, render
 from vinemap.simulate.grounds import RESOLUTION
 
@@ -72,6 +73,23 @@ def test_a_patch_that_goes_its_own_way_does_not_agree():
     assert some.fit
     some.scores[8:] = 0.3
     assert not some.fit
+
+
+@pytest.mark.parametrize("part", [0.25, 0.5, 0.75])
+def test_parts_of_a_pixel_are_not_drawn_to_whole_ones(part):
+    """To 0.02 pixels, as waves of six pixels are by linear interpolation at a quarter of one."""
+    x, y = np.meshgrid(np.arange(LOW.width), np.arange(LOW.height))
+    rng = np.random.default_rng(0)
+    waves = [(np.cos(a), np.sin(a), b) for a, b in rng.uniform(0, 2 * np.pi, (40, 2))]
+
+    def seen(off):
+        image = sum(np.cos((x - off) * c + y * s + b) for c, s, b in waves)
+        return view_of(np.rint(128 + 6 * image).clip(0, 255).astype(np.uint8), camera=LOW)
+
+    middle = (LOW.height / 2, LOW.width / 2)
+    found = patches_at(seen(0), seen(part), middle, Place(0.0, middle[0], middle[1] + part))
+    assert len(found.scores) > 20
+    assert np.abs(np.mean(found.shifts, axis=0)).max() < 0.005
 
 
 def over_relief(seed):

@@ -47,7 +47,7 @@ MOST_APART = 0.65
 """Pixels of fine detail, root mean square, over the mean correlation of patches, from which on they disagree across the
 movement as no ground's do: what they share are shadows that move over it."""
 
-MOST_UNSURE = 1.5, np.radians(0.4)
+MOST_UNSURE = 1.3, np.radians(0.35)
 """Standard deviations in pixels of fine detail and radians of a step from which on the ground isn't flat enough."""
 PLANE = 0.5
 """Share of the patches' disagreement that is left if it is that of a plane that is tilted."""
@@ -55,12 +55,12 @@ SHORT = 12.0
 """Pixels of fine detail of movement below which parallax says nothing."""
 ROUNDS = 4
 """Times that patches are weighed by how far they disagree."""
-ALIKE, MOST_LIKE = 1.6, 0.6
+ALIKE, MOST_LIKE = 1.2, 0.6
 """How much more patches vary together, at least, than each for itself, as neighbours err alike; the largest correlation
 of neighbours of which that is told."""
 SINGULAR = 1e10
 """By how much variances are inflated, at least, by other unknowns that patches can't tell apart from theirs."""
-LEAST_SPREAD = 0.015
+LEAST_SPREAD = 0.01
 """Pixels by which patches disagree at least."""
 
 
@@ -198,13 +198,18 @@ def _alike(left: Values, orders: Sequence[Ints]) -> Values:
 
 
 def patches_at(view: View, next_view: View, centre: Sequence[float], place: Place) -> Patches:
-    """Where patches of what two frames both show lie, by a movement."""
+    """Where patches of what two frames both show lie, by a movement.
+
+    Between pixels, linear interpolation puts detail too near to the nearer one, by up to some hundredths of a pixel
+    that a spread of patches doesn't tell; between those of a frame twice as large it is an eighth of that.
+    """
     import cv2
 
     a, b = view.fine, next_view.fine
     n = fineness(view.image)
     matrix = warp(place.angle, *((np.asarray(at) + 0.5) / n - 0.5 for at in (centre, place[1:])))
-    moved = np.asarray(cv2.warpAffine(a, matrix, b.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    moved = np.asarray(cv2.warpAffine(cv2.pyrUp(a), 2 * matrix, b.shape[::-1], flags=flags))
     half, far = PATCH_HALF, PATCH_HALF + PATCH_REACH
     size = np.array(b.shape[::-1])
     corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (size - 1) - matrix[:, 2]) @ matrix[:, :2]

@@ -163,7 +163,7 @@ def drift_table(found: Mapping[str, Drift]) -> Lines:
             f"{mark(place.mean())}, {mark(place.max())}",
             mark(100 * place.mean() / standard, share, 0),
             f"{mark(turn.mean(), heading)}, {mark(turn.max())}",
-            "" if np.isnan(squared).any() else mark(float(squared.mean()), float(high), 2),
+            "" if np.isnan(squared).any() else f"{squared.mean():.2f}" + "!" * (not low < squared.mean() < high),
         ]
         lines.append([NAMES.get(name, name), *cells])
     return lines
