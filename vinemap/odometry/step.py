@@ -14,7 +14,8 @@ import numpy as np
 from vinemap.errors import InputError
 from vinemap.odometry.correlation import COARSE_STEP, Place, Search, climb, coarse_peaks, peak, place_at, search_of
 from vinemap.odometry.field import cleaner_of
-from vinemap.odometry.judgement import CHANGED, CHANGED_ROUGHLY, MOST_RIVAL, agreement_at, doubt, fit_of, patches_at
+from vinemap.odometry.judgement import CHANGED, CHANGED_ROUGHLY, MOST_RIVAL, agreement_at, doubt
+from vinemap.odometry.patches import fit_of, patches_at
 from vinemap.odometry.poses import Pose, moved, onward
 from vinemap.odometry.refinement import Method, refine
 from vinemap.odometry.views import LEAST_CONTRAST, View, coarseness, view_of
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from vinemap.compute.arrays import Flags, Image, Values
     from vinemap.config.camera import Camera
     from vinemap.odometry.correlation import Index
-    from vinemap.odometry.judgement import Fit
+    from vinemap.odometry.patches import Fit
 
 Strategy = Literal["coarse to fine", "exhaustive"]
 ANGLES = (-9.0, 9.0)
