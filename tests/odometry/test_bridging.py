@@ -181,7 +181,7 @@ def test_wheels_that_compare_with_few_stretches_are_trusted_less():
     track, _ = tracked(bends())
     wheels = wheels_of(bends(), speed=1.005).wheels
     there = slice(2 * 43, 2 * 72)  # the gap, and hardly more than one stretch as long before it
-    parts = Odometer(wheels), Odometer(Wheels(*(values[there] for values in wheels))), None
+    parts = Odometer(wheels), Odometer(Wheels(*(values[there] for values in wheels[:3]))), None
     often, once, alone = (bridged(track, wheels)[GAP[-1]].of_step[0, 0] for wheels in parts)
     assert often < once == pytest.approx(alone)
 

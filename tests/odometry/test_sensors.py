@@ -194,8 +194,8 @@ def test_places_are_in_the_frame_of_the_start_and_accuracies_are_horizontal(tmp_
     lon, lat, _ = Geod(ellps="WGS84").fwd(START.lon, START.lat, START.heading_deg, 10.0)
     path = tmp_path / "fixes.csv"
     path.write_text(f"time;lat;lon;accuracy_m\n2026-05-14T08:00:00Z;{lat!r};{lon!r};0.02\nbad;1;2;3\n")
-    fixes, left_out = read_fixes(path, START)
-    assert left_out == 1
+    fixes = read_fixes(path, START)
+    assert fixes.left_out == 1
     assert fixes.xy == pytest.approx(np.array([[10_000.0, 0.0]]), abs=1)
     assert fixes.times == pytest.approx([1778745600])
     assert np.hypot(fixes.sd, fixes.sd) == pytest.approx([20.0])
@@ -204,8 +204,8 @@ def test_places_are_in_the_frame_of_the_start_and_accuracies_are_horizontal(tmp_
 def test_lines_that_jump_are_left_out(tmp_path):
     path = tmp_path / "wheels.csv"
     path.write_text("time,speed_km_h\n1,3.6\n2,3.6\n1.5,3.6\n3,999\n4,3.6\n,3.6\n")
-    found, left_out = read_wheels(path)
-    assert left_out == 3
+    found = read_wheels(path)
+    assert found.left_out == 3
     assert found.times.tolist() == [1, 2, 4]
     assert found.speeds == pytest.approx([1000] * 3)
     assert np.isnan(found.rates).all()

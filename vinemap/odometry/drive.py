@@ -129,6 +129,7 @@ def map_drive(
         raise InputError(f"{rows}: distances from rows need a start: give --start lat,lon,heading")
     lines = _rows_of(rows) if rows else None
     sensors = _read_sensors(motion, fixes, start)
+    odometer = Odometer(sensors.wheels) if sensors.wheels else None
     source = read_recording(recording, camera=camera)
 
     def followed() -> list[TrackPoint]:
@@ -140,7 +141,7 @@ def map_drive(
             angles=angles,
             method=method,
             foresight=MEMORY,
-            sensor=sensors.odometer,
+            sensor=odometer,
         )
         return list(told)
 
@@ -149,7 +150,7 @@ def map_drive(
         placed([TrackPoint("", None, STILL, np.zeros((3, 3)), np.zeros((3, 3)), camera.above_ground_mm)])
     track = step(STAGES[0], followed)
     _check_track(track, recording, camera)
-    track, remarks = step(STAGES[1], _held_against, sensors, track)
+    track, remarks = step(STAGES[1], _held_against, sensors, odometer, track)
     layers = step(STAGES[1], placed, track)
     step(STAGES[2], _write, layers, out)
     flags = [point.flag for point in track if point.flag]
@@ -166,38 +167,37 @@ def map_drive(
 
 
 class _Sensors(NamedTuple):
-    """What goes with a camera: wheels, satellite fixes, their files, and how many lines of these were left out."""
+    """What goes with a camera, and from which files."""
 
     motion: Path | None
     wheels: Wheels | None
-    odd_wheels: int
     fixes: Path | None
     known: Fixes | None
-    odd_fixes: int
-    odometer: Odometer | None
 
 
 def _read_sensors(motion: Path | None, fixes: Path | None, start: Start | None) -> _Sensors:
     if fixes and not start:
         raise InputError(f"{fixes}: fixes need a start: give --start lat,lon,heading, roughly")
-    wheels, odd_wheels = read_wheels(motion) if motion else (None, 0)
-    known, odd_fixes = read_fixes(fixes, start) if fixes and start else (None, 0)
-    return _Sensors(motion, wheels, odd_wheels, fixes, known, odd_fixes, Odometer(wheels) if wheels else None)
+    known = read_fixes(fixes, start) if fixes and start else None
+    return _Sensors(motion, read_wheels(motion) if motion else None, fixes, known)
 
 
-def _held_against(sensors: _Sensors, track: list[TrackPoint]) -> tuple[list[TrackPoint], tuple[str, ...]]:
+def _held_against(
+    sensors: _Sensors, odometer: Odometer | None, track: list[TrackPoint]
+) -> tuple[list[TrackPoint], tuple[str, ...]]:
     """A track whose gaps are crossed and which is pulled to fixes, and what is to be said of the sensors."""
-    motion, wheels, odd_wheels, fixes, known, odd_fixes, odometer = sensors
+    motion, wheels, fixes, known = sensors
     remarks: list[str] = []
     if motion and wheels:
         check_times(motion, wheels.times, track)
-        remarks += [f"{odd_wheels} lines of {motion} left out"] * (odd_wheels > 0)
+        remarks += [f"{wheels.left_out} lines of {motion} left out"] * (wheels.left_out > 0)
         remarks += _against_wheels(motion, wheels, track)
     if not (fixes and known):
         return bridged(track, odometer), tuple(remarks)
     check_times(fixes, known.times, track)
     track, far, fit = joined(track, known, odometer)
-    remarks += [f"{odd_fixes + far} of {odd_fixes + len(known.sd)} fixes left out"] * (odd_fixes + far > 0)
+    odd = known.left_out + far
+    remarks += [f"{odd} of {known.left_out + len(known.sd)} fixes left out"] * (odd > 0)
     remarks += ["fixes contradict the track by more than both err"] * (not fit)
     return track, tuple(remarks)
 

@@ -26,10 +26,12 @@ class Fixes(NamedTuple):
     times: Values
     xy: Values
     sd: Values
+    left_out: int = 0
+    """Lines of the file that tell no place."""
 
 
-def read_fixes(path: Path, start: Start) -> tuple[Fixes, int]:
-    """Read satellite fixes from a CSV, and tell how many lines were left out.
+def read_fixes(path: Path, start: Start) -> Fixes:
+    """Read satellite fixes from a CSV.
 
     Accuracies are horizontal, as receivers state them: the root of the mean square of distances from the true place
     (DRMS), √2 times the standard deviation along an axis where both axes have the same.
@@ -51,4 +53,4 @@ def read_fixes(path: Path, start: Start) -> tuple[Fixes, int]:
     east, north, _ = wgs84_to_main(degrees, Origin(start.lat, start.lon, 0.0)).T
     a = np.radians(start.heading_deg)
     xy = 1000 * np.column_stack([east * np.sin(a) + north * np.cos(a), north * np.sin(a) - east * np.cos(a)])
-    return Fixes(times[kept], xy, 1000 * accuracy[kept] / np.sqrt(2)), int(len(times) - kept.sum())
+    return Fixes(times[kept], xy, 1000 * accuracy[kept] / np.sqrt(2), int(len(times) - kept.sum()))

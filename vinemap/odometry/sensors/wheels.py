@@ -40,6 +40,8 @@ class Wheels(NamedTuple):
     times: Values
     speeds: Values
     rates: Values
+    left_out: int = 0
+    """Lines of the file that tell nothing, or what can't be."""
 
     def between(self, start: float | None, end: float | None, usual: Pose) -> tuple[Pose, Values] | None:
         """Movement and covariance (3, 3) from a time to another, a guess as usual where untold; none of a gap.
@@ -100,8 +102,8 @@ class Odometer:
             self._seconds += end - start
 
 
-def read_wheels(path: Path) -> tuple[Wheels, int]:
-    """Read wheel speeds and yaw rates from a CSV, and tell how many lines were left out.
+def read_wheels(path: Path) -> Wheels:
+    """Read wheel speeds and yaw rates from a CSV.
 
     Raises
     ------
@@ -127,4 +129,5 @@ def read_wheels(path: Path) -> tuple[Wheels, int]:
     kept &= go_on(times, kept)
     if kept.sum() < 2:
         raise InputError(f"{path}: holds fewer than two lines with a time and a number: give more")
-    return Wheels(times[kept], *(values[kept] for values in found)), int(len(times) - kept.sum())
+    speeds, rates = (values[kept] for values in found)
+    return Wheels(times[kept], speeds, rates, int(len(times) - kept.sum()))
