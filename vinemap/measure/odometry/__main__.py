@@ -126,7 +126,7 @@ def bridged(grounds: Sequence[str | Path], count: int) -> tuple[dict[str, Lines]
 @click.option("--paths", "count", type=click.IntRange(1), default=20, show_default=True, help="Paths of 9.6 m.")
 @click.option("--photograph", "photographs", multiple=True, type=FILE, help="Ground of one's own, 0.4 mm a pixel.")
 @click.option("--out", type=FILE, default=Path("build/odometry"), show_default=True, help="Folder of the plots.")
-@click.option("--docs", type=PAGE, help="Markdown file to fill between its marks; a plot goes beside it.")
+@click.option("--docs", type=PAGE, help="Markdown file to fill; a plot of terrains, sizes and paths goes beside.")
 def main(
     parts: Sequence[str],
     steps: int,
@@ -168,7 +168,7 @@ def main(
         for name, table in tables.items():
             text = fill(text, name, as_markdown(table))
         docs.write_text(text, encoding="utf-8")
-        if not parts:
+        if {"errors", "paths", "sizes"} <= panels.keys():
             overview = [panels["errors"][0] + panels["paths"][0][:1], panels["sizes"][0] + panels["paths"][0][1:]]
             plots.save(overview, docs.with_name("odometry.png"))
     missed = sum(cell.count("!") for table in tables.values() for line in table[1:] for cell in line)
