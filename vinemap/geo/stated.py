@@ -219,9 +219,9 @@ def check_together(source: CRS, place: Place, path: PurePath, first: PurePath) -
     except ProjError as error:
         own = stated(source).name
         raise InputError(f"{path}: {own} can't be brought to {target.name}, that of {first.name}") from error
-    if (vertical := vertical_name(source)) != place.vertical:
+    if (datum := vertical_name(source)) != place.vertical:
         raise InputError(
-            f"{path}: its heights are above {vertical or 'no datum that it states'}, those of {first.name} above "
+            f"{path}: its heights are above {datum or 'no datum that it states'}, those of {first.name} above "
             f"{place.vertical or 'none'}: say with --crs EPSG:n+m what all are"
         )
 
@@ -299,13 +299,13 @@ def check_steps(sample: Floats, n: int, header: Any, crs: CRS, path: PurePath) -
     with np.errstate(over="ignore"):  # of a box that was never set
         whole, part = np.ptp([header.mins[:2], header.maxs[:2]], axis=0), np.ptp(sample[:, :2], axis=0)
         areas = [(np.prod(side * metres), n) for side, n in ((whole, header.point_count), (part, n))]
-    apart = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
+    gap = min((float(np.sqrt(area / n)) for area, n in areas if area > 0), default=0.0)
     sizes = [*metres, vertical_unit(crs)]
     shown_steps = _shown_steps(sample, header.scales)
     for axis, shown, scale, size in zip("xyz", shown_steps, header.scales, sizes, strict=True):
         step = max(float(scale), shown)
-        if step * size > max(FINE, apart):
-            lie = f"lie {apart:.2f} m apart" if apart else "all lie in one place"
+        if step * size > max(FINE, gap):
+            lie = f"lie {gap:.2f} m apart" if gap else "all lie in one place"
             known = f"{step:g} (scale {scale:g}), {float(f'{step * size:.2g}'):g} m"
             raise InputError(
                 f"{path}: its {axis} is stored in steps of {known}, but its points {lie}: "

@@ -63,8 +63,8 @@ def map_one(config: SurveyConfig, parcel: str, *, step: Callable[..., Any]) -> S
     products = products_folder(config.survey)
     alone = config.boundaries is None and not paths.survey_boundaries(config.survey).exists()
     check_engines(config.all_settings())
-    chosen = config if alone else config.model_copy(update={"parcels": [parcel]})
-    plan = plan_survey(chosen, products, again=True)
+    own = config if alone else config.model_copy(update={"parcels": [parcel]})
+    plan = plan_survey(own, products, again=True)
     recipe = next((recipe for recipe in plan.recipes if recipe.parcel == parcel), None)
     if recipe is None:
         why = [outcome.reason for outcome in plan.settled if outcome.parcel == parcel]

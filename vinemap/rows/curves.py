@@ -99,15 +99,15 @@ def trace_rows(
 
     def trace(members: Ints) -> tuple[float, float, bool, float, float, float, shapely.LineString] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
-        between, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
-        course = _centred(ordered, cover, between, double) if len(ordered) > 1 else None
-        if course is None or course.width > max(max_width, CLOSED * between):
+        apart, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
+        course = _centred(ordered, cover, apart, double) if len(ordered) > 1 else None
+        if course is None or course.width > max(max_width, CLOSED * apart):
             return None
         line = shapely.LineString(course.curve)
         slender = line.length >= max(min_length, 3 * course.width)
         fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
         numbers = course.width, course.amount, course.support
-        return (between, double, bool(told[members].mean() > 0.5), *numbers, line) if fits else None
+        return (apart, double, bool(told[members].mean() > 0.5), *numbers, line) if fits else None
 
     clusters = key_points.groupby("cluster").indices
     records = [record for record in in_threads(trace, clusters.values()) if record]

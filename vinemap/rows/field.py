@@ -112,23 +112,23 @@ def _resample(peaks: Peaks, plain: Values, grid: Grid, base: Grid, step: float, 
     x, y = grid.centres()
     i, j = np.meshgrid((base.north - y) / step, (x - base.west) / step, indexing="ij")
 
-    def at(values: Values) -> Values:
+    def there(values: Values) -> Values:
         out: Values = map_coordinates(values, [i, j], order=1, mode="nearest")
         return out
 
     strength, turned, spacings = peaks.strength, np.nan_to_num(peaks.direction), np.nan_to_num(peaks.spacing)
     wave = strength**2 * np.exp(2j * turned)
-    mean = at(wave.real) + 1j * at(wave.imag)
+    mean = there(wave.real) + 1j * there(wave.imag)
     direction = np.mod(np.degrees(np.angle(mean) / 2), 180)
-    weight = at(strength**2)
-    spacing = at(strength**2 * spacings) / np.maximum(weight, 1e-12)
+    weight = there(strength**2)
+    spacing = there(strength**2 * spacings) / np.maximum(weight, 1e-12)
     # Where blocks meet, or rows a hedge, none runs between their directions.
     unlike = np.abs(mean) < ALIGNED * weight
     nearest = _strongest_of_four(strength**2, i[unlike], j[unlike])
     direction[unlike], spacing[unlike] = np.degrees(turned[nearest]), spacings[nearest]
     reach = 2 * round(NEAR / FIELD_RESOLUTION) + 1
     near = maximum_filter(_block_mean(cover, FIELD_RESOLUTION).values, reach) > LEAST_COVER
-    likelihood = np.where(near, at(strength), 0.0)
+    likelihood = np.where(near, there(strength), 0.0)
     known = weight > 1e-9
 
     def raster(values: Values) -> Raster:
@@ -138,7 +138,7 @@ def _resample(peaks: Peaks, plain: Values, grid: Grid, base: Grid, step: float, 
         raster(np.where(known, direction, np.nan)),
         raster(np.where(known, spacing, np.nan)),
         raster(likelihood),
-        plain=raster(at(plain)),
+        plain=raster(there(plain)),
     )
 
 

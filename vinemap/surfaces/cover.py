@@ -126,7 +126,7 @@ def canopy_cover(
         Heights from which points count as canopy, and where trees stand.
     """
     grid = grid_over(*cloud.extent, resolution=resolution)
-    flat, lone = (_grown(things(chm, high), MARGIN, chm.grid.resolution) for things in (flat_things, trees))
+    flat, lone = (_grown(find(chm, high), MARGIN, chm.grid.resolution) for find in (flat_things, trees))
     top = height_about(replace(chm, values=np.where(flat | lone, np.nan, chm.values)), high)
     foot = np.where(_grows(top), np.clip(FOOT * top, LEAST, low), low).astype(np.float32)
     ridge = np.maximum(RIDGE * top, foot).astype(np.float32)
@@ -293,8 +293,8 @@ def _about(rows: gpd.GeoDataFrame | None, blocks: Grid) -> Flags:
     if rows is None:
         return np.zeros(blocks.shape, dtype=bool)
     spacing = rows["spacing_m"].to_numpy()
-    strips = shapely.union_all(shapely.buffer(shapely.force_2d(rows.geometry.to_numpy()), spacing))
-    inside = shapely.buffer(strips, -float(np.median(spacing)) / 2)
+    alleys = shapely.union_all(shapely.buffer(shapely.force_2d(rows.geometry.to_numpy()), spacing))
+    inside = shapely.buffer(alleys, -float(np.median(spacing)) / 2)
     out: Flags = np.asarray(shapely.contains_xy(inside, *np.meshgrid(*blocks.centres())))
     return out
 

@@ -216,12 +216,12 @@ def write_page(
     parcel = record["parcel"]
     canopies = paths.canopy_mesh(folder, parcel).read_bytes()
     try:
-        page = parcel_page(record, layers, dtm, chm, canopies)
+        text = parcel_page(record, layers, dtm, chm, canopies)
     except MemoryError:
         raise
     except Exception as error:  # noqa: BLE001 - as said
         return [f"it has no page: {own_fault(error)}"]
-    paths.report(folder, parcel).write_text(page, encoding="utf-8")
+    paths.report(folder, parcel).write_text(text, encoding="utf-8")
     return []
 
 

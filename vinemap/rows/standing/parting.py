@@ -61,8 +61,8 @@ def own_rows(rows: Mapping[int, Standing]) -> dict[int, Standing]:
     chord /= np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
     canopies = shapely.buffer(lines, [row.half[1] for row in standing], cap_style="flat")
     one, other = shapely.STRtree(canopies).query(lines, predicate="intersects")
-    across = np.abs(chord[one, 0] * chord[other, 1] - chord[one, 1] * chord[other, 0]) > ASLANT
-    one, other = one[across], other[across]
+    aslant = np.abs(chord[one, 0] * chord[other, 1] - chord[one, 1] * chord[other, 0]) > ASLANT
+    one, other = one[aslant], other[aslant]
     for k in sorted(set(one.tolist()), key=lambda k: standing[k].length):
         own = shapely.union_all([shapely.LineString(between(standing[k].curve, *run)) for run in standing[k].runs])
         theirs = shapely.union_all(canopies[other[(one == k) & held[other]]])

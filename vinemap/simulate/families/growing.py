@@ -104,5 +104,5 @@ def net(rng: np.random.Generator) -> Survey:
     """A net above the vines that a third of the rays don't pass."""
     rows = block(rng, length=rng.uniform(28, 35), n=7)
     outline = shapely.MultiLineString(rows).convex_hull.buffer(1.0)
-    net = Sheet(outline, rng.uniform(3.0, 3.4), depth=0.03, caught=rng.uniform(0.3, 0.4))
-    return survey_of(rng, rows, sheets=[net], obstacles=posts(rows, top=net.height))
+    sheet = Sheet(outline, rng.uniform(3.0, 3.4), depth=0.03, caught=rng.uniform(0.3, 0.4))
+    return survey_of(rng, rows, sheets=[sheet], obstacles=posts(rows, top=sheet.height))
