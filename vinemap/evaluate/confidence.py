@@ -30,6 +30,8 @@ EVIDENCE = {
 """Logarithm of the odds by which each ingredient, from 0 to 1, makes a row more sure."""
 DOUBT = 3.3 - sum(EVIDENCE.values())
 """Logarithm of the odds of a row for which nothing speaks; 3.3, or 96%, is that of one for which everything does."""
+DOUBTFUL = 0.5
+"""Confidence, of a row or of its canopy, below which it is worth a look."""
 CUT = 2.0
 """Logarithm of the odds by which a row is less sure all of whose canopy is cut."""
 

@@ -13,6 +13,7 @@ from vinemap.canopy.mesh import breaks, corners_of
 from vinemap.canopy.numbers import HIGH, LOW, TOP, quantile_of
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
+from vinemap.evaluate.confidence import DOUBTFUL
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,8 +35,6 @@ CROWD = 1.2
 """Points of a patch, on the mean, of which the outermost is the surface's; a lone one is any of the foliage's depth."""
 UPPER = 2 / 3
 """Share of a canopy's depth above which it is seen from both sides, and tells its middle."""
-SURE = 0.5
-"""Confidence in a canopy below which its points don't tell where its surface is."""
 NUMBERS = ("mesh_error_m", "mesh_median_m", "mesh_95_m", "mesh_inside")
 """What is told of a row."""
 
@@ -88,7 +87,7 @@ def measure_meshes(
         told[int(row[first])] = _error(section[mine], near, model.reach), *_spread(near[0].distance)
     nothing = (np.nan,) * len(NUMBERS)
     table = np.array([told.get(int(one), nothing) for one in rows["row_id"]]).reshape(-1, len(NUMBERS))
-    known = (rows["canopy_confidence"].to_numpy(dtype=float) >= SURE) & (not tops)
+    known = (rows["canopy_confidence"].to_numpy(dtype=float) >= DOUBTFUL) & (not tops)
     table[~known, 0] = np.nan
     return rows.assign(**dict(zip(NUMBERS, table.T, strict=True)))
 

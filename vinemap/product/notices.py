@@ -9,6 +9,7 @@ import shapely
 
 from vinemap.compute.beside import nearest_beside
 from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
+from vinemap.evaluate.confidence import DOUBTFUL
 from vinemap.evaluate.unmapped import ALONE, LOW, ROWLESS, TALL, WIDE
 from vinemap.geo.crs import project
 from vinemap.geo.curve import across, at_each, resample, tangents_of_each
@@ -32,8 +33,6 @@ COVERED = 0.95
 """Share of a parcel that a survey of it covers."""
 DENSE = 60.0
 """Points a square metre below which canopies come out poorly."""
-SURE = 0.5
-"""Confidence, of a row or of its canopy, below which it is worth a look."""
 FEW = 5.0
 """Points a square metre below which vines may not be seen."""
 MISTAKEN = 0.4
@@ -85,11 +84,11 @@ def notices(
     polygon = shapely.union_all(parcel.geometry.to_numpy())
     covered = _covered(polygon, seen, chm.grid, side)
     density = n_points / max(np.count_nonzero(seen) * side**2, 1.0)
-    doubtful = int((rows["confidence"] < SURE).sum())
+    doubtful = int((rows["confidence"] < DOUBTFUL).sum())
     remarks = {
         f"the cloud covers {covered:.0%} of the parcel": covered < COVERED,
         f"{density:.0f} points/m², canopies are poor below {DENSE:.0f}": density < DENSE,
-        f"{doubtful} of {len(rows)} rows are doubtful (confidence below {SURE:g})": doubtful > 0,
+        f"{doubtful} of {len(rows)} rows are doubtful (confidence below {DOUBTFUL:g})": doubtful > 0,
     }
     told = [remark for remark, holds in remarks.items() if holds] + _doubtful_canopies(rows)
     return told + (_in_no_row(unmapped) if len(rows) else [_why_nothing(unmapped, density)])
@@ -189,10 +188,10 @@ def change_notices(kept: Mapping[str, str]) -> list[str]:
 
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:
     """That heights, widths and volumes of rows aren't to be trusted, whose canopies weren't seen well."""
-    doubtful = int((rows["canopy_confidence"] < SURE).sum())
+    doubtful = int((rows["canopy_confidence"] < DOUBTFUL).sum())
     remark = (
         f"heights, widths and volumes of {doubtful} of {len(rows)} rows are doubtful: their canopies were seen too "
-        f"sparsely or unevenly (canopy_confidence below {SURE:g})"
+        f"sparsely or unevenly (canopy_confidence below {DOUBTFUL:g})"
     )
     return [remark] if doubtful else []
 

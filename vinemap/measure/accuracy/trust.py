@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vinemap.canopy.numbers import judge_canopies, summarise_rows
+from vinemap.evaluate.confidence import DOUBTFUL
 from vinemap.measure.accuracy.rows import quantile
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from vinemap.chain import RowMap
     from vinemap.compute.arrays import Flags, Floats
 
-SURE, DOUBTFUL = 0.9, 0.5
-"""Confidence of rows that are sure, and below which they are doubtful."""
+SURE = 0.9
+"""Confidence from which rows are sure."""
 MOSTLY, HALF = 0.99, 0.5
 """Share of the sure ones that must be right, and of the doubtful ones that may be."""
 BINS = np.linspace(0, 1, 11)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinemap.evaluate.changes import follow_rows
-from vinemap.product.notices import SURE
+from vinemap.evaluate.confidence import DOUBTFUL
 from vinemap.product.pages.page import whole_numbers
 from vinemap.product.seasons.products import seen_lengths, shift_between
 
@@ -52,7 +52,7 @@ def history(flights: Sequence[tuple[Product, gpd.GeoDataFrame]], *, latest: Chan
         date = shape[1] - 1 - k
         labels[found, date] = table["label"]
         if "canopy_confidence" in table:
-            doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < SURE
+            doubtful[found, date] = table["canopy_confidence"].to_numpy(dtype=float) < DOUBTFUL
         shown = table.assign(seen_m=seen_lengths(table))
         for name, column in values.items():
             column[found, date] = shown[name]
