@@ -292,7 +292,8 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     groups = _comparable(rows)
     for name, sizes in (("height", height), ("width", width)):
         odd = _unlike(sizes, groups)
-        flags = [",".join(filter(None, [said, name * flagged])) for said, flagged in zip(flags, odd, strict=True)]
+        for k in np.flatnonzero(odd).tolist():
+            flags[k] = f"{flags[k]},{name}".lstrip(",")
     return rows.assign(canopy_confidence=confidence, flags=flags)
 
 

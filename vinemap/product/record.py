@@ -73,9 +73,9 @@ def record_of(
     *,
     origin: Origin | Corner,
     n_key_points: int,
-    square: bool = False,
-    remarks: Sequence[str] = (),
-    shift: Shift | None = None,
+    square: bool,
+    remarks: Sequence[str],
+    shift: Shift | None,
 ) -> dict[str, Any]:
     """What ``run.json`` tells, but for times and files.
 
@@ -133,7 +133,7 @@ def record_of(
         + height_notices(layers["rows"], chm, layers["unmapped"], highest=recipe.settings.cover.high)
         + ground_notices(layers["rows"], chm)
         + ([] if recipe.known else pair_notices(layers["rows"]))
-        + [SQUARE] * (square and not recipe.known),
+        + ([SQUARE] if square and not recipe.known else []),
         "versions": versions | made_by(recipe.settings.ground),
     }
 

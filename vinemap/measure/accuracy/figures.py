@@ -157,4 +157,5 @@ def _cell(value: float, measure: Measure, eased: float | None) -> str:
     bar = measure.bar if eased is None else eased
     # As precise as it is printed, so that a value that reads like the bar meets it.
     shown = round(value, measure.digits)
-    return f"{shown:.{measure.digits}f}" + "!" * (shown < bar if measure.at_least else abs(shown) > bar)
+    missed = shown < bar if measure.at_least else abs(shown) > bar
+    return f"{shown:.{measure.digits}f}{'!' if missed else ''}"
