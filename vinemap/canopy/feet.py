@@ -63,11 +63,11 @@ def _foot(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
     """
     bins = round(HIGHEST / FOOT_BIN)
     across, height = np.abs(canopy.points[:, 0]), canopy.points[:, 1].copy()
-    levels = _pooled(_histograms(height, canopy.start, 0.0, FOOT_BIN, bins), near)
-    half_width = _rank(_pooled(_histograms(across, canopy.start, 0.0, FOOT_BIN, bins), near), FOOT_WIDTH) * FOOT_BIN
+    levels = _pooled(_histograms(height, canopy.start, bins), near)
+    half_width = _rank(_pooled(_histograms(across, canopy.start, bins), near), FOOT_WIDTH) * FOOT_BIN
     middle = across < FOOT_SIDES * np.repeat(half_width, np.diff(canopy.start))
     height = np.where(middle, HIGHEST + FOOT_BIN, height)
-    sides = _pooled(_histograms(height, canopy.start, 0.0, FOOT_BIN, bins + 1)[:, :-1], near)
+    sides = _pooled(_histograms(height, canopy.start, bins + 1)[:, :-1], near)
     low, high, half, top = (_rank(levels, q) for q in (*FOOT_RANKS, 0.5, 1 - FOOT_RANKS[0]))
     thins_out = low - FOOT_RANKS[0] / (FOOT_RANKS[1] - FOOT_RANKS[0]) * (high - low)
     reach = FOOT_DEPTH * (top - thins_out)
@@ -83,7 +83,7 @@ def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
     bins = math.ceil(float(np.abs(across).max(initial=FOOT_BIN)) / FOOT_BIN) + 1
     beyond = FOOT_BIN * (bins + 1)
     shown = [
-        _pooled(_histograms(np.where(at_foot & (away >= 0), away, beyond), canopy.start, 0.0, FOOT_BIN, bins + 1), near)
+        _pooled(_histograms(np.where(at_foot & (away >= 0), away, beyond), canopy.start, bins + 1), near)
         for away in (-across, across)
     ]
     right, left = (side[:, :-1] for side in shown)
@@ -112,12 +112,12 @@ def _pooled(histograms: Values, near: tuple[Ints, Ints]) -> Values:
 
 
 @compiled
-def _histograms(values: Values, start: Ints, low: float, width: float, bins: int) -> Values:
-    """Histograms (m, bins) of each section's values; what lies beyond counts in the outer bins."""
+def _histograms(values: Values, start: Ints, bins: int) -> Values:
+    """Histograms (m, bins) of each section's values, by ``FOOT_BIN``; what lies beyond counts in the outer bins."""
     out = np.zeros((len(start) - 1, bins))
     for k in range(len(start) - 1):
         for p in range(start[k], start[k + 1]):
-            out[k, min(max(int((values[p] - low) / width), 0), bins - 1)] += 1
+            out[k, min(max(int(values[p] / FOOT_BIN), 0), bins - 1)] += 1
     return out
 
 
