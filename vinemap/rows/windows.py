@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation, binary_opening, distance_transform_edt, label
 
-from vinemap.compute.links import parts_of
+from vinemap.compute.links import NEXT, parts_of
 from vinemap.geo.curve import turn_between
 from vinemap.surfaces.waves import ASKEW, CLEAR, Peaks
 
@@ -178,17 +178,7 @@ def settled(peaks: Peaks, *, least: float) -> Peaks:
     my, mx = peaks.direction.shape
     index = np.arange(my * mx).reshape(my, mx)
     held = peaks.strength > 0
-    pairs = np.concatenate(
-        [
-            np.column_stack([index[a].ravel(), index[b].ravel()])
-            for a, b in (
-                (np.s_[:, :-1], np.s_[:, 1:]),
-                (np.s_[:-1], np.s_[1:]),
-                (np.s_[:-1, :-1], np.s_[1:, 1:]),
-                (np.s_[:-1, 1:], np.s_[1:, :-1]),
-            )
-        ]
-    )
+    pairs = np.concatenate([np.column_stack([index[a].ravel(), index[b].ravel()]) for a, b in NEXT])
     pairs = pairs[held.ravel()[pairs].all(axis=1)]
     one, other = pairs.T
     direction, spacing = peaks.direction.ravel(), peaks.spacing.ravel()

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.special import ndtr, ndtri
 
 from vinemap.cloud.bins import cells_a_block
-from vinemap.compute.links import parts_of
+from vinemap.compute.links import NEXT, parts_of
 from vinemap.errors import InputError
 from vinemap.geo.raster import Grid, Raster, cell_of, coarser, grid_over, sample
 from vinemap.surfaces.planes import multiscale_fit, quadratic_trend
@@ -170,19 +170,12 @@ def _fit_terrain(
 
 def _layers(height: Floats, thin: Flags, step: float) -> Ints:
     """Layer (ny, nx) of each cell: cells beside each other, within a step in height, are of one if either is thin."""
-    return parts_of(height.size, *_links(height, thin, step)).reshape(height.shape)
-
-
-def _links(height: Floats, thin: Flags, step: float) -> Ints:
-    """Flat indices (2, k) of cells that are of one layer."""
     index = np.arange(height.size, dtype=np.int32).reshape(height.shape)
     ends = []
-    for i, j in (0, 1), (1, 0), (1, 1), (1, -1):
-        one = np.s_[i:, max(j, 0) : j or None if j < 0 else None]
-        other = np.s_[: -i or None, max(-j, 0) : -j if j > 0 else None]
+    for one, other in NEXT:
         linked = (thin[one] | thin[other]) & (np.abs(height[one] - height[other]) < step)
         ends.append(np.stack([index[one][linked], index[other][linked]]))
-    return np.concatenate(ends, axis=1)
+    return parts_of(height.size, *np.concatenate(ends, axis=1)).reshape(height.shape)
 
 
 def _fall(surface: Values) -> Floats:
