@@ -10,7 +10,7 @@ import tempfile
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any
 
-from vinemap.compute.processes import die_with_parent, python
+from vinemap.compute.processes import die_with_parent, ended_by, last_line, python
 from vinemap.errors import VinemapError, WorkerError
 
 if TYPE_CHECKING:
@@ -68,12 +68,8 @@ def _answer(process: subprocess.Popen[bytes], said: IO[bytes]) -> tuple[int, Any
         code = process.wait()
     else:
         return answer
-    said.seek(max(0, said.seek(0, os.SEEK_END) - 4096))
-    lines = [line for line in said.read().decode(errors="replace").splitlines() if line.strip()]
-    name = f"exit code {code}"
-    with suppress(ValueError):
-        name = signal.Signals(-code).name
-    error = WorkerError(f"its process died of {name}{f': {lines[-1].strip()[:200]}' if lines else ''}")
+    name, last = ended_by(code), last_line(said)[:200]
+    error = WorkerError(f"its process died of {name}{f': {last}' if last else ''}")
     error.heals = name == "SIGKILL"
     raise error
 

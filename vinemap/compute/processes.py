@@ -12,7 +12,7 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from vinemap.errors import VinemapError
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 STOPPING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name))
 """Signals by which this system asks a process to end, beside Ctrl-C."""
+TAIL = 4096
+"""Bytes at the end of what a process wrote in which its last line is looked for."""
 PR_SET_PDEATHSIG = 1
 """Of Linux's prctl(2)."""
 
@@ -45,6 +47,20 @@ def python(code: str, *words: str) -> list[str]:
     return [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {code}", *words]
 
 
+def last_line(said: IO[bytes]) -> str:
+    """The last line that a process wrote to a file, blank ones aside; nothing if it wrote none."""
+    said.seek(max(0, said.seek(0, os.SEEK_END) - TAIL))
+    lines = [line for line in said.read().splitlines() if line.strip()]
+    return lines[-1].decode(errors="replace").strip() if lines else ""
+
+
+def ended_by(code: int) -> str:
+    """What ended a process of this exit code: the name of the signal that did, or else the code itself."""
+    with suppress(ValueError):
+        return signal.Signals(-code).name
+    return f"exit code {code}"
+
+
 def run_process(command: Sequence[str], *, limit: float | None = None, env: Mapping[str, str] | None = None) -> Outcome:
     """Run a command, kill it after ``limit`` seconds, and measure it; ``env`` is its environment, by default ours."""
     with tempfile.TemporaryFile() as stderr:
@@ -61,8 +77,7 @@ def run_process(command: Sequence[str], *, limit: float | None = None, env: Mapp
         finally:
             timer.cancel()
         seconds = time.perf_counter() - began
-        stderr.seek(0)
-        said = stderr.read().decode(errors="replace").strip().split("\n")[-1]
+        said = last_line(stderr)
     if limit and seconds >= limit:
         said = f"stopped after {limit:g} s"
     return Outcome(process.returncode, seconds, peak, said)

@@ -15,7 +15,6 @@ import queue
 import signal
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import traceback
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from vinemap.compute import machine
-from vinemap.compute.processes import die_with_parent
+from vinemap.compute.processes import die_with_parent, ended_by, last_line, python
 from vinemap.errors import VinemapError, WorkerError, own_fault
 
 if TYPE_CHECKING:
@@ -33,9 +32,7 @@ T = TypeVar("T")
 
 LENGTH = struct.Struct("<Q")
 """Of the number of bytes that stands before a message."""
-SERVE = (
-    "import sys; sys.path[:] = sys.argv[3:]; from vinemap.jobs.workers import serve; serve(*map(int, sys.argv[1:3]))"
-)
+SERVE = "from vinemap.jobs.workers import serve; serve(*map(int, sys.argv[1:]))"
 KILLED = {"SIGKILL": "killed by the system, perhaps for want of memory", "SIGSEGV": "a segmentation fault"}
 
 
@@ -51,7 +48,7 @@ class Worker:
     """
 
     def __init__(self, *, cores: int = 1, memory: int | None = None) -> None:
-        self._command = [sys.executable, "-c", SERVE, str(cores), str(memory or 0), *sys.path]
+        self._command = python(SERVE, str(cores), str(memory or 0))
         self._process: subprocess.Popen[bytes] | None = None
         self._said: IO[bytes] | None = None
         self._stopped = False
@@ -169,16 +166,9 @@ class Worker:
         """What is said of a process that died, by its exit code and what it said last."""
         if self._stopped:
             return WorkerError("stopped")
-        said: list[bytes] = []
-        if self._said:
-            self._said.seek(max(0, self._said.seek(0, os.SEEK_END) - 4096))
-            said = [line for line in self._said.read().splitlines() if line.strip()]
-        last = f": {said[-1].decode(errors='replace').strip()[:200]}" if said else ""
-        name = f"exit code {code}"
-        if code < 0:  # not on Windows
-            with contextlib.suppress(ValueError):
-                name = signal.Signals(-code).name
-        reason = f"its process died ({', '.join(filter(None, (name, KILLED.get(name))))}){last}"
+        name, last = ended_by(code), last_line(self._said)[:200] if self._said else ""
+        why = f"{name}, {KILLED[name]}" if name in KILLED else name
+        reason = f"its process died ({why}){f': {last}' if last else ''}"
         return _healing(reason) if name == "SIGKILL" else WorkerError(reason)
 
 
