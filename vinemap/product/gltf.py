@@ -16,7 +16,7 @@ from vinemap.geo.crs import parse_crs
 from vinemap.product.json_values import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import ArrayLike, NDArray
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from vinemap.compute.arrays import Floats, Ints
 
-STRIP = 5
-"""glTF's mode of triangle strips."""
+TRIANGLES, STRIP = 4, 5
+"""glTF's modes of triangles one by one, and of a strip of them."""
 Z_UP_TO_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion (x, y, z, w) that takes x east, y north, z up to glTF's x east, y up, z south."""
 GREEN = [0.13, 0.33, 0.07, 1.0]
@@ -151,8 +151,7 @@ def write_glb(
         scenes=[gltf.Scene(nodes=[0])],
         nodes=[root],
     )
-    positions, indices = bytearray(), bytearray()
-    stored: dict[bytes, int] = {}
+    packed = _Packed()
     for mesh in meshes:
         node = gltf.Node(name=mesh.label, extras=_known(jsonable({"row_id": mesh.row_id, **mesh.extras})))
         out.nodes.append(node)
@@ -161,71 +160,81 @@ def write_glb(
         middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         node.translation = (middle - zero).tolist()
         node.mesh = len(out.meshes)
-        local, pieces = (mesh.vertices - middle).astype("<f4"), () if plain else mesh.pieces
-        if not plain:
+        if plain:
+            local = (mesh.vertices - middle).astype("<f4")
+        else:
             local, step = _quantise(mesh.vertices - middle)
             node.scale = [step] * 3
-        ends = np.cumsum([piece.sections * piece.corners for piece in pieces])
-        orders = [_strip(*piece) for piece in pieces] or [mesh.faces.ravel()]
-        mode, primitives = gltf.TRIANGLE_STRIP if pieces else gltf.TRIANGLES, []
-        for points, order in zip(np.split(local, ends[:-1]), orders, strict=True):
-            # 65535 is the primitive restart value.
-            kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(points) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
-            drawn = order.astype(kind).tobytes()
-            if drawn not in stored:
-                stored[drawn] = len(out.accessors)
-                indices += b"\0" * (-len(indices) % 4)
-                out.accessors.append(
-                    gltf.Accessor(
-                        bufferView=1, byteOffset=len(indices), componentType=code, count=len(order), type=gltf.SCALAR
-                    )
-                )
-                indices += drawn
-            out.accessors.append(
-                gltf.Accessor(
-                    bufferView=0,
-                    byteOffset=len(positions),
-                    componentType=gltf.FLOAT if plain else gltf.SHORT,
-                    count=len(points),
-                    type=gltf.VEC3,
-                    min=points[:, :3].min(axis=0).tolist(),
-                    max=points[:, :3].max(axis=0).tolist(),
-                )
-            )
-            positions += points.tobytes()
-            attributes = gltf.Attributes(POSITION=len(out.accessors) - 1)
-            primitives.append(gltf.Primitive(attributes=attributes, indices=stored[drawn], material=0, mode=mode))
+        primitives = [packed.primitive(*drawn) for drawn in _drawn(mesh, local, plain=plain)]
         out.meshes.append(gltf.Mesh(name=mesh.label, primitives=primitives))
     root.children = list(range(1, len(out.nodes)))
+    out.accessors = packed.accessors
     if out.meshes:
         if not plain:
             out.extensionsUsed = out.extensionsRequired = ["KHR_mesh_quantization"]
-        out.materials = [
-            gltf.Material(
-                name="foliage",
-                pbrMetallicRoughness=gltf.PbrMetallicRoughness(
-                    baseColorFactor=GREEN, metallicFactor=0.0, roughnessFactor=0.9
-                ),
-            )
-        ]
+        foliage = gltf.PbrMetallicRoughness(baseColorFactor=GREEN, metallicFactor=0.0, roughnessFactor=0.9)
+        out.materials = [gltf.Material(name="foliage", pbrMetallicRoughness=foliage)]
+        first, second = len(packed.positions), len(packed.indices)
+        stride = 12 if plain else 8
         out.bufferViews = [
-            gltf.BufferView(
-                buffer=0,
-                byteOffset=0,
-                byteLength=len(positions),
-                byteStride=12 if plain else 8,
-                target=gltf.ARRAY_BUFFER,
-            ),
-            gltf.BufferView(
-                buffer=0, byteOffset=len(positions), byteLength=len(indices), target=gltf.ELEMENT_ARRAY_BUFFER
-            ),
+            gltf.BufferView(buffer=0, byteOffset=0, byteLength=first, byteStride=stride, target=gltf.ARRAY_BUFFER),
+            gltf.BufferView(buffer=0, byteOffset=first, byteLength=second, target=gltf.ELEMENT_ARRAY_BUFFER),
         ]
-        out.buffers = [gltf.Buffer(byteLength=len(positions) + len(indices))]
+        out.buffers = [gltf.Buffer(byteLength=first + second)]
     # pygltflib's own save_binary writes an empty, thus invalid, buffer where there are no rows.
     document = json.dumps(out, default=_properties, separators=(",", ":")).encode()
-    binary = _chunk(b"BIN\0", bytes(positions + indices), b"\0") if positions else b""
+    binary = _chunk(b"BIN\0", bytes(packed.positions + packed.indices), b"\0") if out.meshes else b""
     chunks = _chunk(b"JSON", document, b" ") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _drawn(
+    mesh: Mesh, local: NDArray[np.float32 | np.int16], *, plain: bool
+) -> Iterator[tuple[NDArray[np.float32 | np.int16], Ints, int]]:
+    """Vertices of each primitive of a mesh, in what order they are drawn, and glTF's mode of that."""
+    if plain or not mesh.pieces:
+        yield local, mesh.faces.ravel(), TRIANGLES
+        return
+    ends = np.cumsum([piece.sections * piece.corners for piece in mesh.pieces])
+    for piece, points in zip(mesh.pieces, np.split(local, ends[:-1]), strict=True):
+        yield points, _strip(*piece), STRIP
+
+
+class _Packed:
+    """Bytes of positions and of indices, and the accessors that find in them those of each primitive."""
+
+    def __init__(self) -> None:
+        self.positions, self.indices = bytearray(), bytearray()
+        self.accessors: list[Any] = []
+        self._orders: dict[bytes, int] = {}
+
+    def primitive(self, points: NDArray[np.float32 | np.int16], order: Ints, mode: int) -> Any:
+        """Take a primitive's vertices (n, ≥3), and the order in which they are drawn, which may be another's, too."""
+        import pygltflib as gltf
+
+        # 65535 is the primitive restart value.
+        kind, code = ("<u2", gltf.UNSIGNED_SHORT) if len(points) <= 65535 else ("<u4", gltf.UNSIGNED_INT)
+        drawn = order.astype(kind).tobytes()
+        if drawn not in self._orders:
+            self._orders[drawn] = len(self.accessors)
+            self.indices += b"\0" * (-len(self.indices) % 4)
+            at = {"bufferView": 1, "byteOffset": len(self.indices)}
+            self.accessors.append(gltf.Accessor(**at, componentType=code, count=len(order), type=gltf.SCALAR))
+            self.indices += drawn
+        self.accessors.append(
+            gltf.Accessor(
+                bufferView=0,
+                byteOffset=len(self.positions),
+                componentType=gltf.FLOAT if points.dtype == np.float32 else gltf.SHORT,
+                count=len(points),
+                type=gltf.VEC3,
+                min=points[:, :3].min(axis=0).tolist(),
+                max=points[:, :3].max(axis=0).tolist(),
+            )
+        )
+        self.positions += points.tobytes()
+        attributes = gltf.Attributes(POSITION=len(self.accessors) - 1)
+        return gltf.Primitive(attributes=attributes, indices=self._orders[drawn], material=0, mode=mode)
 
 
 def _properties(part: Any) -> dict[str, Any]:
