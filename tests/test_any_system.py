@@ -18,6 +18,7 @@ from vinemap.compute import machine, processes
 from vinemap.config.surveys import load_survey
 from vinemap.errors import OutputError, WorkerError
 from vinemap.jobs import workers
+from vinemap.measure.bench import watched
 from vinemap.product import store
 from vinemap.product.geopackage import write_layer
 
@@ -30,7 +31,7 @@ from pathlib import Path
 warnings.simplefilter("ignore")
 from vinemap.terminal import plain_errors
 from vinemap.compute import machine
-from vinemap.compute.processes import run_process
+from vinemap.measure.bench.watched import run_process
 from vinemap.jobs.workers import Workers
 from vinemap.product import store
 with plain_errors():
@@ -121,9 +122,9 @@ def test_only_signals_that_are_there_stop_it():
 
 def test_memory_where_the_system_does_not_tell(monkeypatch):
     monkeypatch.delattr(os, "sysconf", raising=False)
-    monkeypatch.setattr(processes, "Path", lambda path: Path(path.replace("/proc", "/no/proc")))
+    monkeypatch.setattr(watched, "Path", lambda path: Path(path.replace("/proc", "/no/proc")))
     assert machine.memory() <= 8 << 30
-    assert processes.resident(os.getpid()) == 0
+    assert watched.resident(os.getpid()) == 0
 
 
 @pytest.mark.parametrize(("code", "heals"), [(3221225477, False), (1, False), (-9, True)])

@@ -12,10 +12,8 @@ import pytest
 from click.testing import CliRunner
 from systems import LINUX
 
-from vinemap.compute import processes
-from vinemap.compute.processes import high_water
 from vinemap.errors import ConfigError, VinemapError
-from vinemap.measure.bench import instead, runs
+from vinemap.measure.bench import instead, runs, watched
 from vinemap.measure.bench.__main__ import main, parse_sizes
 from vinemap.measure.bench.alternatives import course, memory_since
 from vinemap.measure.bench.bars import (
@@ -34,6 +32,7 @@ from vinemap.measure.bench.plot import draw
 from vinemap.measure.bench.runs import cold, many, prefect
 from vinemap.measure.bench.surveys import dense, plot
 from vinemap.measure.bench.tables import bar_table, dense_table, figures, stage_table, write_tables
+from vinemap.measure.bench.watched import high_water
 
 FOUND = Found(rows=20, right=20, extra=0, length=2000.0, volume=-0.1)
 SECONDS = {"Reading": 1.0, "DTM": 2.0, "Curves": 0.5, "Ends and gaps": 0.25, "Mesh": 0.0, "Writing": 1.0, "All": 5.0}
@@ -71,18 +70,18 @@ def test_growth(exponent):
 @LINUX
 def test_memory_of_processes_is_summed():
     held = "x = bytearray(60_000_000); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(1.5)"
-    with processes.summed_memory() as most:
+    with watched.summed_memory() as most:
         children = [subprocess.Popen([sys.executable, "-c", held]) for _ in range(2)]
         for child in children:
             child.wait()
     assert 120e6 < most[0] < 250e6
-    assert processes.resident(children[0].pid) == 0
+    assert watched.resident(children[0].pid) == 0
 
 
 @LINUX
 def test_memory_that_processes_share_counts_once():
     forked = "import os, time; x = bytearray(b'1') * 100_000_000; os.fork(), os.fork(); time.sleep(1.5)"
-    with processes.summed_memory() as most:
+    with watched.summed_memory() as most:
         subprocess.run([sys.executable, "-c", forked], check=True)
     assert 100e6 < most[0] < 250e6  # each by itself: 400e6; they are looked at one after the other, while they fork
 
@@ -158,19 +157,19 @@ def test_sizes_are_numbers():
 
 
 def test_processes_are_measured_and_stopped():
-    done = processes.run_process([sys.executable, "-c", "x = bytearray(100_000_000)"])
+    done = watched.run_process([sys.executable, "-c", "x = bytearray(100_000_000)"])
     assert done.code == 0
     assert done.seconds > 0
     assert done.peak > 100e6
-    failed = processes.run_process(
+    failed = watched.run_process(
         [sys.executable, "-c", "import sys; print('why', file=sys.stderr); sys.exit('no luck')"]
     )
     assert (failed.code, failed.said) == (1, "no luck")
-    hung = processes.run_process([sys.executable, "-c", "import time; time.sleep(60)"], limit=0.3)
+    hung = watched.run_process([sys.executable, "-c", "import time; time.sleep(60)"], limit=0.3)
     assert hung.code < 0
     assert hung.said == "stopped after 0.3 s"
     with pytest.raises(VinemapError, match="ended with code 1: no luck"):
-        processes.must([sys.executable, "-c", "import sys; sys.exit('no luck')"])
+        watched.must([sys.executable, "-c", "import sys; sys.exit('no luck')"])
 
 
 def test_the_document_is_filled(tmp_path):
@@ -226,7 +225,7 @@ def test_a_line_through_a_cluster():
 
 
 def test_memory_that_the_system_does_not_tell(monkeypatch):
-    monkeypatch.setattr(processes, "Path", lambda path: Path(path.replace("/proc", "/no/proc")))
+    monkeypatch.setattr(watched, "Path", lambda path: Path(path.replace("/proc", "/no/proc")))
     assert high_water() is None
     assert memory_since(None) == ""
 
@@ -249,7 +248,7 @@ def test_an_alternative_that_fails_costs_nothing(tmp_path, monkeypatch):
     files = {"cloud": "none.laz", "boundary": "none.gpkg", "truth": "none.gpkg"}
     monkeypatch.setattr(instead, "ensure_survey", lambda *_: files)
     monkeypatch.setattr(instead, "find_spec", lambda module: module in ("cv2", "pdal"))
-    monkeypatch.setattr(instead, "run_process", lambda *_, **__: processes.Outcome(-9, 600.0, 1, "stopped after 600 s"))
+    monkeypatch.setattr(instead, "run_process", lambda *_, **__: watched.Outcome(-9, 600.0, 1, "stopped after 600 s"))
     stages = with_other(dict.fromkeys(["DTM", "Canopy cover", "Curves"], 0.5) | {"All": 2.0})
     lines = instead.instead(1, "F", run(1)._replace(seconds=stages), tmp_path)
     assert lines[-1] == ["c-gons", "cv2", "–", "stopped after 600 s", "–", "–"]
@@ -264,12 +263,12 @@ def test_a_cold_start_has_an_empty_cache(tmp_path, monkeypatch):
     def took(command, *, env=None):
         if env is None:
             (tmp_path / "jobs" / "example.json").write_text('{"cloud": "a", "boundary": "b"}', encoding="utf-8")
-            return processes.Outcome(0, 1.0, 0, "")
+            return watched.Outcome(0, 1.0, 0, "")
         cache = Path(env["NUMBA_CACHE_DIR"])
         asked.append(cache)
         is_empty = not any(cache.iterdir())
         (cache / "compiled").touch()
-        return processes.Outcome(0, 20.0 + len(asked) if is_empty else 4.0, 0, "")
+        return watched.Outcome(0, 20.0 + len(asked) if is_empty else 4.0, 0, "")
 
     monkeypatch.setattr(runs, "must", took)
     assert cold(tmp_path)[1][1:] == ["21.0 s", "4.0 s", "17.0 of 12.0! s; 8 s are the goal"]

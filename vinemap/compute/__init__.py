@@ -1,4 +1,4 @@
-"""Work on all cores: compiled loops and their cache, threads, parts that hang together, the machine, watched processes.
+"""Work on all cores: compiled loops and their cache, threads, parts that hang together, the machine, processes.
 
 Locks between processes lie here as well. Nothing here knows of vineyards.
 """

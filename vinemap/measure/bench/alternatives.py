@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from vinemap.compute.processes import high_water
 from vinemap.measure.bench.surveys import plot
+from vinemap.measure.bench.watched import high_water
 
 if TYPE_CHECKING:
     from collections.abc import Callable

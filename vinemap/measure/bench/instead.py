@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from vinemap.compute.processes import run_process
 from vinemap.measure.bench.bars import Found, Run, span
 from vinemap.measure.bench.runs import ensure_survey, job, judge, load
+from vinemap.measure.bench.watched import run_process
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinemap.compute.processes import high_water
 from vinemap.measure.bench.alternatives import best, ground, polygons, rows
 from vinemap.measure.bench.surveys import estate, example, survey
+from vinemap.measure.bench.watched import high_water
 from vinemap.measure.bench.whole import whole
 
 if TYPE_CHECKING:

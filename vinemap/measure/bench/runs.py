@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vinemap import paths
-from vinemap.compute.processes import must, summed_memory
 from vinemap.measure.bench.bars import ALL, COLD, GOAL, MANY_MEMORY, MANY_TIMES, Bar, Found, Run, of_bar, with_other
+from vinemap.measure.bench.watched import must, summed_memory
 
 if TYPE_CHECKING:
     from vinemap.measure.bench.tables import Lines
