@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vinemap.rows.centre_line import centre_line, runs_above, whittaker
+from vinemap.rows.centre_line import _whittaker, centre_line, runs_above, whittaker
 
 
 def test_runs_above_a_level():
@@ -31,7 +31,7 @@ def test_whittaker_fades_across_gaps_with_a_ridge():
     weights = np.ones(400)
     weights[150:250] = 0
     values = np.where(weights > 0, 1.0, 99.0)
-    smooth = whittaker(values, weights, cutoff=20, ridge=0.02)
+    smooth = _whittaker(values, weights, 20.0, 0.0, 0.02)
     assert abs(smooth[200]) < 0.2
     assert smooth[50] == pytest.approx(1, abs=0.03)
 

@@ -145,15 +145,14 @@ def _centroids(excess: Values, offsets: Values, centre: Values, reach: float, me
         measured[i], weight[i] = moment / max(amount, 1e-9), amount
 
 
-def whittaker(values: Values, weights: Values, *, cutoff: float, slope: float = 0.0, ridge: float = 0.0) -> Values:
-    """Smooth values (n,) by penalised least squares on their second and first differences (Eilers 2003).
+def whittaker(values: Values, weights: Values, *, cutoff: float) -> Values:
+    """Smooth values (n,) by penalised least squares on their second differences (Eilers 2003).
 
     ``cutoff`` is the wavelength, in samples, that is halved where weights are 1; where they are 0 the smoothest
-    course is carried over, drawn to zero between stretches by ``ridge`` (a share of the mean weight). ``slope`` is a
-    wavelength for first differences: with it, a short stretch between gaps can't take a slope of its own.
+    course is carried over.
     """
     data, weight = (np.ascontiguousarray(v, dtype=float) for v in (values, weights))
-    return _whittaker(data, weight, float(cutoff), float(slope), float(ridge))
+    return _whittaker(data, weight, float(cutoff), 0.0, 0.0)
 
 
 @compiled
@@ -175,6 +174,11 @@ def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
 
 @compiled
 def _whittaker(values: Values, weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
+    """The same, where wanted with first differences, and drawn to zero in gaps by a ridge, a share of the mean weight.
+
+    ``slope`` is a wavelength for first differences: with it, a short stretch between gaps can't take a slope of its
+    own.
+    """
     if len(values) < 3:
         return values.copy()
     weighted = np.empty(len(values))
