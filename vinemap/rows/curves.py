@@ -7,7 +7,7 @@ centroids are the row's course.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import geopandas as gpd
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.sparse.linalg import matrix_power
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
-from vinemap.geo.curve import between, extend, normals, resample
+from vinemap.geo.curve import between, extend, normals, resample, turn_between
 from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import centre_line, half_width, runs_above, whittaker
 from vinemap.rows.standing.canopy import thereabouts
@@ -32,6 +32,8 @@ BIN = 0.05
 LONE_WIDTH, LONE_SHARE = 0.85, 0.25
 """Metres of canopy across beyond which, and share of the median length below which, a row with no other beside it is
 a hedge or a bush."""
+SAME_DIRECTION = np.radians(20)
+"""Radians by which rows beside each other may differ."""
 BESIDE = 1.3
 """Spacings within which a row runs beside another."""
 AMONG = 4
@@ -97,26 +99,29 @@ def trace_rows(
     spacing, curtains = key_points["spacing_m"].to_numpy(), key_points["curtains_m"].to_numpy()
     told = key_points["told"].to_numpy()
 
-    def trace(members: Ints) -> tuple[float, float, bool, float, float, float, shapely.LineString] | None:
+    def trace(members: Ints) -> dict[str, Any] | None:
         ordered = order_key_points(xy[members], direction[members], threshold=threshold)
         apart, double = float(np.median(spacing[members])), float(np.median(curtains[members]))
         course = _centred(ordered, cover, apart, double) if len(ordered) > 1 else None
         if course is None or course.width > max(max_width, CLOSED * apart):
             return None
         line = shapely.LineString(course.curve)
-        slender = line.length >= max(min_length, 3 * course.width)
-        fits = slender and _turn(course.curve) <= 2 / 3 * line.length / min_radius
-        numbers = course.width, course.amount, course.support
-        return (apart, double, bool(told[members].mean() > 0.5), *numbers, line) if fits else None
+        if line.length < max(min_length, 3 * course.width) or _turn(course.curve) > 2 / 3 * line.length / min_radius:
+            return None
+        return {
+            "spacing_m": apart,
+            "curtains_m": double,
+            "told": bool(told[members].mean() > 0.5),
+            "width": course.width,
+            "amount": course.amount,
+            "support": course.support,
+            "geometry": line,
+        }
 
     clusters = key_points.groupby("cluster").indices
     records = [record for record in in_threads(trace, clusters.values()) if record]
-    columns = ("spacing_m", "curtains_m", "told", "width", "amount", "support")
-    rows = gpd.GeoDataFrame(
-        {name: [r[k] for r in records] for k, name in enumerate(columns)},
-        geometry=[r[-1] for r in records],
-        crs=key_points.crs,
-    )
+    columns = ("spacing_m", "curtains_m", "told", "width", "amount", "support", "geometry")
+    rows = gpd.GeoDataFrame({name: [record[name] for record in records] for name in columns}, crs=key_points.crs)
     if len(rows):
         usual = rows["support"].iloc[_typical(rows["support"].to_numpy(), rows.length.to_numpy())]
         rows = rows[rows["support"] >= min(min_support, SPARSE * usual)]
@@ -124,7 +129,7 @@ def trace_rows(
     rows = rows[~_repeated(rows)]
     rows = rows[_like_the_others(rows)]
     least = max(2 * min_length, LONE_SHARE * float(rows.length.median())) if len(rows) else 0.0
-    alone = ~_accompanied(rows)
+    alone = ~np.isin(np.arange(len(rows)), _neighbours(rows)[:, 0])
     odd = alone & ((rows.length < least) | (rows["width"] > LONE_WIDTH))
     kept = ["spacing_m", "curtains_m", "told", "alone", "geometry"]
     return rows.assign(alone=alone).loc[~odd, kept].reset_index(drop=True)
@@ -159,7 +164,7 @@ def order_key_points(xy: Values, direction: Values, *, threshold: float = 2.0) -
 @compiled
 def _scan(xy: Values, direction: Values, start: int, heading: Values, threshold: float) -> list[int]:
     """Indices of the enhanced key points that follow on a start towards a heading."""
-    found = [start]
+    found = [start]  # by which the compiler knows what it is a list of
     found.pop()
     here = start
     while len(found) < len(xy):
@@ -279,13 +284,6 @@ def _enclosed(rows: gpd.GeoDataFrame, pairs: Ints) -> Flags:
     return out
 
 
-def _accompanied(rows: gpd.GeoDataFrame) -> Flags:
-    """Whether another row of about the same direction lies a spacing from each."""
-    out = np.zeros(len(rows), dtype=bool)
-    out[_neighbours(rows)[:, 0]] = True
-    return out
-
-
 def _neighbours(rows: gpd.GeoDataFrame) -> Ints:
     """Pairs (k, 2) of rows of about the same direction that lie no more than a spacing apart."""
     lines = rows["simple"].to_numpy()
@@ -297,6 +295,5 @@ def _neighbours(rows: gpd.GeoDataFrame) -> Ints:
     spacing = rows["spacing_m"].to_numpy()
     i, j = shapely.STRtree(lines).query(lines, predicate="dwithin", distance=BESIDE * spacing)
     beside = (i != j) & (shapely.distance(lines[i], lines[j]) <= BESIDE * np.minimum(spacing[i], spacing[j]))
-    parallel = np.abs(np.sin(angle[i] - angle[j])) < np.sin(np.radians(20))
-    out: Ints = np.column_stack([i, j])[parallel & beside]
+    out: Ints = np.column_stack([i, j])[beside & (turn_between(angle[i], angle[j]) < SAME_DIRECTION)]
     return out
