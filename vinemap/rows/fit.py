@@ -142,12 +142,12 @@ def _parted(
 ) -> dict[int, Standing]:
     """Those of the rows that end in the canopies of others, without what isn't theirs."""
     out, places = {}, list(rows)
-    for n, (course, theirs, beside) in part_rows(list(rows.values()), spacing[places], cover, margin=MARGIN).items():
-        k, curves = places[n], [course, *beside]
+    for n, parted in part_rows(list(rows.values()), spacing[places], cover, margin=MARGIN).items():
+        k, curves = places[n], [parted.course, *parted.beside]
         like = np.full(len(curves), k)
         for group, shares in dealt(curves, half[like], curtains[like], [None] * len(curves)):
             own = [share for m, share in zip(group, shares, strict=True) if m == 0]
-            if own and (row := fitted(own[0], theirs=theirs)):
+            if own and (row := fitted(own[0], theirs=parted.theirs)):
                 out[k] = row
     return out
 

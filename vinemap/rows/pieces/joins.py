@@ -133,9 +133,9 @@ def join(
     *,
     track_width: float,
     high: float,
-    cover: Raster | None = None,
-    chm: Raster | None = None,
-    seen: Seen | None = None,
+    cover: Raster | None,
+    chm: Raster | None,
+    seen: Seen | None,
 ) -> Ints:
     """Row (m,) of each piece of a tree of key points: ends are paired in the order of ``pairs`` (k, 2).
 

@@ -75,9 +75,7 @@ def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:
     return Gaps((a + b) / 2, (b - a) / np.maximum(length, 1e-9)[:, None], length, spacing)
 
 
-def on_tracks(
-    gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None = None, seen: Seen | None = None
-) -> Flags:
+def on_tracks(gaps: Gaps, tree: cKDTree, *, track_width: float, cover: Raster | None, seen: Seen | None) -> Flags:
     """Whether the gap between two ends (k, 2) is part of a track or a headland, where the rows beside it end, too.
 
     Gaps of neighbouring rows that lie side by side are judged as one, those on a line aslant, too. What lies farther
