@@ -113,7 +113,6 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
         indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``
         and ``full``, the shares of both sides, and of the width, on which there are points.
     """
-    n_points, height, bottom, width, area, good, under, over, reduction, seen, full = measures
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
     ends = at.origin[:, None, :2] + reach[:, :, None] * normal[:, None]
@@ -122,21 +121,21 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
         {
             "row_id": at.row_id,
             "position_m": at.position,
-            "height_m": height,
-            "bottom_m": bottom,
-            "width_m": width,
-            "area_m2": area,
-            "n_points": n_points,
+            "height_m": measures.height,
+            "bottom_m": measures.bottom,
+            "width_m": measures.width,
+            "area_m2": measures.area,
+            "n_points": measures.n_points,
             "extent_m": at.extent,
-            "trv_m3_ha": height * width * HECTARE / at.spacing,
-            "lwa_m2_ha": 2 * (height - bottom) * HECTARE / at.spacing,
-            "good": good,
-            "under": under,
-            "over": over,
-            "reduction": reduction,
-            "quality": good - (under + over) + reduction,
-            "seen": seen,
-            "full": full,
+            "trv_m3_ha": measures.height * measures.width * HECTARE / at.spacing,
+            "lwa_m2_ha": 2 * (measures.height - measures.bottom) * HECTARE / at.spacing,
+            "good": measures.good,
+            "under": measures.under,
+            "over": measures.over,
+            "reduction": measures.reduction,
+            "quality": measures.good - (measures.under + measures.over) + measures.reduction,
+            "seen": measures.seen,
+            "full": measures.full,
         },
         geometry=shapely.linestrings(np.concatenate([ends, level], axis=2)) if len(ends) else [],
         crs=crs,
