@@ -34,10 +34,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import geopandas as gpd
+    import shapely
 
     from vinemap.canopy.mesh import Mesh
     from vinemap.canopy.model import CanopyModel
+    from vinemap.chain import RowMap
     from vinemap.cloud.tiles import Cloud, Collector
+    from vinemap.config.settings import Settings
+    from vinemap.evaluate.shift import Shift
+    from vinemap.geo.main import Corner, Origin
     from vinemap.product.recipe import Recipe
 
 
@@ -64,63 +69,30 @@ def make_product(
     dict
         What ``run.json`` is to tell, but for times and files.
     """
-    parcel, settings, origin = recipe.parcel, recipe.settings, recipe.origin
-    apart, high = settings.sections.step, settings.cover.high
+    parcel, settings = recipe.parcel, recipe.settings
     with aside() as beside:
         polygon = project(*recipe.boundary, points.crs) if recipe.boundary else None
         known = recipe.known.lines if recipe.known else None
-        shift = map_rows(points, settings, known=known).shift if known is not None and settings.rows.align else None
-        if shift:
-            points = moved(points, -shift.metres, aligned)
+        points, was_off = _aligned(points, known, settings, aligned)
         found = map_rows(points, settings, within=polygon, known=known, step=run)
-        shift, surfaces = shift or found.shift, (found.dtm, found.chm)
-        rasters = rasters_of(*surfaces, found.field)
+        rasters = rasters_of(found.dtm, found.chm, found.field)
         written = beside(write_rasters, draft, parcel, rasters)
-        model = model_canopies(found, settings, step=run)
-        main = origin or corner_of(found.dtm)
-        rows = judge_canopies(summarise_rows(found.rows, model.table, step=apart), model.table, step=apart)
-        rows, table = as_seen(rows, model.table, tops=recipe.tops)
-        rows, ends, enhanced = describe_rows(rows, parcel=parcel, origin=main, threshold=settings.curves.threshold)
-        standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
-        vine_spacing = settings.missing.vine_spacing
-        rows, gaps, vines = run(
-            "Vines",
-            find_vines,
-            rows,
-            found.gaps,
-            table,
-            found.cover,
-            vine_spacing=vine_spacing,
-            step=apart,
-            known=standing,
-        )
-        rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=apart, tops=recipe.tops)
-        del model  # much memory, that what follows doesn't need
-        outlines = parcel_layer(parcel, rows, polygon, points)
-        layers = {
-            "rows": rows,
-            "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
-            "key_points": enhanced,
-            "sections": labelled(table, rows),
-            "gaps": labelled(gaps, rows),
-            "vines": labelled(vines, rows),
-            "unmapped": run("Unmapped", find_unmapped, found.chm, rows, outlines if polygon else None, tallest=high),
-            "parcel": outlines,
-        }
+        main = recipe.origin or corner_of(found.dtm)
+        layers, meshes, strays = _layers(recipe, found, points, polygon, main, run)
         record = record_of(
             recipe,
             found.cloud,
             layers,
-            surfaces,
+            (found.dtm, found.chm),
             origin=main,
-            shift=shift,
+            shift=was_off or found.shift,
             square=found.field.square,
             n_key_points=found.n_key_points,
             remarks=[*found.remarks, *strays],
         )
 
         cut = (found.cloud, found.rows, found.gaps, found.dtm) if settings.product.classified else None
-        del found
+        del found  # much memory, that what follows doesn't need
 
         def write() -> list[str]:
             how = settings.product.model_dump(include={"plain", "geoid", "audit"})
@@ -133,8 +105,53 @@ def make_product(
 
         record["warnings"] += run("Writing", write)
     shutil.rmtree(paths.tiles(draft), ignore_errors=True)
-    write_item(draft, recipe, record, outlines)
+    write_item(draft, recipe, record, layers["parcel"])
     return record
+
+
+def _aligned(
+    points: Cloud, known: gpd.GeoDataFrame | None, settings: Settings, collector: Collector
+) -> tuple[Cloud, Shift | None]:
+    """Points, moved to known rows where that is wanted, and how far they lay off these, if it is and they did."""
+    shift = map_rows(points, settings, known=known).shift if known is not None and settings.rows.align else None
+    return (moved(points, -shift.metres, collector), shift) if shift else (points, None)
+
+
+def _layers(
+    recipe: Recipe,
+    found: RowMap,
+    points: Cloud,
+    polygon: shapely.Geometry | None,
+    main: Origin | Corner,
+    run: Callable[..., Any],
+) -> tuple[dict[str, gpd.GeoDataFrame], list[Mesh], list[str]]:
+    """Layers of a product by the rows that were found, with what their canopies, vines and meshes tell.
+
+    Beside them the meshes, and what is to be known of known vines: a sentence each.
+    """
+    settings, step = recipe.settings, recipe.settings.sections.step
+    model = model_canopies(found, settings, step=run)
+    rows = judge_canopies(summarise_rows(found.rows, model.table, step=step), model.table, step=step)
+    rows, table = as_seen(rows, model.table, tops=recipe.tops)
+    rows, ends, key_points = describe_rows(rows, parcel=recipe.parcel, origin=main, threshold=settings.curves.threshold)
+    standing, strays = vines_in_rows(recipe.vines, rows, found.shift)
+    how = {"vine_spacing": settings.missing.vine_spacing, "step": step, "known": standing}
+    rows, gaps, vines = run("Vines", find_vines, rows, found.gaps, table, found.cover, **how)
+    rows, meshes = run("Mesh", _meshes, found.cloud, model, rows, step=step, tops=recipe.tops)
+    del model  # much memory, that what follows doesn't need
+    outlines = parcel_layer(recipe.parcel, rows, polygon, points)
+    within, tallest = outlines if polygon else None, settings.cover.high
+    layers = {
+        "rows": rows,
+        "row_ends": ends.assign(beyond=beyond_ends(rows, found.seen, polygon)),
+        "key_points": key_points,
+        "sections": labelled(table, rows),
+        "gaps": labelled(gaps, rows),
+        "vines": labelled(vines, rows),
+        "unmapped": run("Unmapped", find_unmapped, found.chm, rows, within, tallest=tallest),
+        "parcel": outlines,
+    }
+    return layers, meshes, strays
 
 
 def _meshes(
