@@ -130,16 +130,12 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     register = _registered(config, date, polygons, rows, lost)
     plan = Plan(sources, date, [], [*lost, *strays], listed, register)
     lasting = {FAILED} if listed else {FAILED, OUTSIDE}
-    hopeless = {} if again else {name: one for name, one in known.items() if one.state in lasting and not one.heals}
-    for name, polygon in polygons.items():
-        if isinstance(polygon, InputError):
-            state = LEFT if isinstance(polygon, NoAreaError) and not listed else FAILED
-            plan.settled.append(Outcome(name, state, reason=str(polygon)))
+    hopeless = {name: one for name, one in known.items() if one.state in lasting and not one.heals}
+    plan.settled.extend(_unusable(polygons, listed=listed))
     caseless = paths.is_caseless(folder)
     named, nameless = _named(_whole(polygons), caseless=caseless)
     plan.settled.extend(nameless)
     for parcel, polygon in named.items():
-        place = paths.parcel_folder(folder, parcel)
         own = config.of_parcel(parcel)
         boundary, remarks = polygon or (None, ())
         recipe = Recipe(
@@ -156,18 +152,32 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             known=rows.get(parcel),
             vines=vines.get(parcel),
         )
-        key = recipe.key
-        product = None if again else product_in(place)
-        if product and (product.key, product.parcel) == (key, parcel):
-            numbers = product.rows, product.length, 0.0
-            plan.settled.append(Outcome(parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key))
-        elif parcel in hopeless and hopeless[parcel].key == key:
-            plan.settled.append(hopeless[parcel])
+        settled = None if again else _settled(recipe, paths.parcel_folder(folder, parcel), hopeless.get(parcel))
+        if settled:
+            plan.settled.append(settled)
         else:
             plan.recipes.append(recipe)
     if not listed:
         plan.settled.extend(_gone(folder, config.survey, polygons, caseless=caseless))
     return plan
+
+
+def _unusable(polygons: Mapping[str, Parcel | InputError | None], *, listed: bool) -> list[Outcome]:
+    """What becomes of parcels whose polygons can't be used: what is none is left out, where nobody has named it."""
+    return [
+        Outcome(name, LEFT if isinstance(one, NoAreaError) and not listed else FAILED, reason=str(one))
+        for name, one in polygons.items()
+        if isinstance(one, InputError)
+    ]
+
+
+def _settled(recipe: Recipe, folder: Path, hopeless: Outcome | None) -> Outcome | None:
+    """What becomes of a parcel that needs no work: its product is up to date, or it would fail as it did before."""
+    key, product = recipe.key, product_in(folder)
+    if product and (product.key, product.parcel) == (key, recipe.parcel):
+        numbers = product.rows, product.length, 0.0
+        return Outcome(recipe.parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key)
+    return hopeless if hopeless and hopeless.key == key else None
 
 
 def elsewhere(config: SurveyConfig, outcomes: Iterable[Outcome]) -> list[Outcome]:
