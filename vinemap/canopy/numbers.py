@@ -108,10 +108,10 @@ def tabulate_sections(at: Sections, polygons: Values, measures: Measures, *, crs
     GeoDataFrame
         LineStringZ with ``row_id``, ``position_m``, ``height_m`` (98.5% height above ground), ``bottom_m``,
         ``width_m`` (2–98% across), ``area_m2`` (the foliage's), ``n_points`` and the ``extent_m`` along the row from
-        which they are; tree-row volume ``trv_m3_ha`` = height ·
-        width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha`` = 2 (height − bottom) · 10,000 / spacing; Table 3.1's
-        indices ``good``, ``under``, ``over``, ``reduction`` and ``quality`` = G − (U + O) + R (Eq. 23); and ``seen``
-        and ``full``, the shares of both sides, and of the width, on which there are points.
+        which they are; tree-row volume ``trv_m3_ha`` = height · width · 10,000 / spacing, leaf-wall area ``lwa_m2_ha``
+        = 2 (height − bottom) · 10,000 / spacing; Table 3.1's indices ``good``, ``under``, ``over``, ``reduction`` and
+        ``quality`` = G − (U + O) + R (Eq. 23); and ``seen`` and ``full``, the shares of both sides, and of the width,
+        on which there are points.
     """
     normal = np.column_stack([-at.tangent[:, 1], at.tangent[:, 0]])
     reach = np.stack([polygons[:, :, 0].min(axis=1), polygons[:, :, 0].max(axis=1)], axis=1)
@@ -251,13 +251,18 @@ def lengths_of(sections: gpd.GeoDataFrame, step: float) -> Values:
 def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: float) -> gpd.GeoDataFrame:
     """Give rows a ``canopy_confidence``, and the flags ``height`` and ``width``; NaN and no flag without a canopy.
 
-    The confidence, from 0 to 1, is the product of seven shares: of the row's length without its gaps that has sections;
-    of the canopy that isn't cut at a side; of the canopy that was seen, on both sides from its lowest points to its
-    top; of its width that holds foliage, and no air between two curtains; of the underside that isn't hidden, as it is
-    where a canopy is wider than deep; of what stands above weeds, where it is low; and of the agreement in width and
-    area of sections a metre apart, or as far as they share no point, in which canopies of one row don't differ much.
-    Flagged are heights and widths whose ratio to the median of their block, or of the rows around one that is of no
-    block, is odd, if rows there don't differ anyway.
+    The confidence, from 0 to 1, is the product of seven numbers from 0 to 1:
+
+    - the share of the row's length without its gaps that has sections;
+    - the share of its canopy that isn't cut at a side;
+    - how much of the canopy was seen, on both sides from its lowest points to its top;
+    - how much of its width holds foliage, and no air between two curtains;
+    - how much of its underside isn't hidden, as it is where a canopy is wider than deep;
+    - where it is low, how much of it stands above weeds;
+    - how well sections agree in width and area that are a metre apart, or so far that they share no point.
+
+    A row's height or width is flagged where its ratio to the median of its block, or of the rows around it where that
+    has few, is odd, unless rows there differ anyway.
 
     Parameters
     ----------
@@ -290,8 +295,7 @@ def judge_canopies(rows: gpd.GeoDataFrame, sections: gpd.GeoDataFrame, *, step: 
     flags = rows["flags"].tolist()
     groups = _comparable(rows)
     for name, sizes in (("height", height), ("width", width)):
-        odd = _unlike(sizes, groups)
-        for k in np.flatnonzero(odd).tolist():
+        for k in np.flatnonzero(_unlike(sizes, groups)).tolist():
             flags[k] = f"{flags[k]},{name}".lstrip(",")
     return rows.assign(canopy_confidence=confidence, flags=flags)
 

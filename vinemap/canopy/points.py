@@ -36,14 +36,15 @@ USUAL_AREA = 1.0
 LOWLY = 1.3
 """Metres below which a row is low."""
 SOLID, RISE, CLEAR = 0.25, 1.5, 0.15
-"""Foliage that goes on at a height has this share, at the least, of the density above, on the mean; not so many times
-that of a height above it, as where another plant begins; and of its own this share, at the most, stands beside it."""
+"""Foliage goes on downwards at a height if its density there is this share, at the least, of the mean above; is no more
+than so many times the least above, as it is where another plant begins; and if no more than this share of it stands
+beside the row."""
 SURE = 3.0
 """Standard deviations of the number of points by which a rise is none of chance."""
 
 
 def above_weeds(height: Values | float) -> Values:
-    """Metres above ground from which canopies as high as (n,) are told from weeds."""
+    """Metres above ground (n,) from which points are taken for canopy rather than weeds, by the rows' heights (n,)."""
     out: Values = np.maximum(LOWEST, FOOT * (np.asarray(height) - LEAST))
     return out
 
@@ -87,7 +88,7 @@ def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacin
 
 
 def canopy_area(size: tuple[float, float], floor: float) -> float:
-    """Square metres across it that a row's canopy fills, about, of a size and floor as above."""
+    """Area in m² of a row's cross-section, roughly: by its height and half width, and the floor of its canopy."""
     top, half = size
     return 2 * _edge(half) * max(top - floor, 0.0)
 

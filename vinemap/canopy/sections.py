@@ -50,10 +50,10 @@ def cut_sections(
     low: float = 0.5,
     high: float = 3.6,
 ) -> list[T]:
-    """Cut sections along every row, except where it has no canopy (Eq. 2–3), and make something of each row's.
+    """Cut sections along every row, except where it has no canopy (Eq. 2–3), and hand each row's to a function.
 
-    Of the soil's points some are enough. All sections together have more points than the cloud; what is made of them
-    row by row, on all cores, is less.
+    All sections together would hold more points than the cloud, as they overlap. So they are handed over row by row,
+    on all cores, and only what ``then`` makes of them is kept. Of the soil's points a section has but some.
 
     Parameters
     ----------
@@ -66,14 +66,19 @@ def cut_sections(
     dtm : Raster
         Terrain, for the sections' origins.
     then : callable
-        Takes a row's Sections; what it returns is returned for each row.
+        Is called with each row's Sections.
     width, step : float
         Extent a of a section along γ, and distance b of sections along γ, in metres.
     min_points, max_width : int, float
-        Points of canopy that sections of a row are widened for, more in canopies of more than a square metre, and
-        metres to which they may be.
+        Sections with fewer points of canopy than the first are widened along the row, up to the second in metres. Of
+        canopies of more than a square metre they need as many more.
     low, high : float
         Heights in metres between which points count as canopy; the lower is less in rows that are low.
+
+    Returns
+    -------
+    list
+        What ``then`` has returned for each row, in their order.
     """
     lines = [shapely.force_2d(line) for line in rows.geometry]
     curves = [shapely.get_coordinates(line) for line in lines]

@@ -87,7 +87,10 @@ def _heights(top: Floats) -> tuple[Floats, Flags]:
 
 
 def _between(one: tuple[Floats, Flags], other: tuple[Floats, Flags]) -> float | None:
-    """Metres between what two files show of a patch; along a row, where nothing tells it, none."""
+    """Metres by which two files' heights of a patch are shifted; None where too little or nothing alike is shown.
+
+    Along a row every shift fits about as well: of all that do, the shortest counts.
+    """
     shifts = np.array(list(product(range(-REACH, REACH + 1), repeat=2)))
     inner = slice(REACH, CELLS - REACH)
     heights, known = one[0][inner, inner], one[1][inner, inner]

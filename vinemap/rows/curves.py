@@ -52,12 +52,16 @@ SMOOTHING = 6.0
 
 
 class _Course(NamedTuple):
-    """Curve (n, 2), width of its canopy in metres, share of its length with canopy, and canopy on a metre of it."""
+    """The middle of a canopy, and its numbers."""
 
     curve: Values
+    """Places (n, 2) along it."""
     width: float
+    """Metres across."""
     support: float
+    """Share of its length that has canopy."""
     amount: float
+    """Square metres of full cover on a metre of it."""
 
 
 def trace_rows(

@@ -67,7 +67,7 @@ class _Wave(NamedTuple):
 def follow_lines(lines: gpd.GeoDataFrame, cover: Raster, *, course: str = "fit", ends: str = "fit") -> gpd.GeoDataFrame:
     """Move lines sideways onto their canopy, each to the nearest row that all those thereabouts agree upon.
 
-    Of two that would come to lie on one row, that stays which would have had to move more.
+    Of two lines that would come to lie on one row, the nearer one takes it, and the other stays where it is.
 
     Parameters
     ----------

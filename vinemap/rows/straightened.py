@@ -35,18 +35,22 @@ REACH = 0.2
 
 
 class Share(NamedTuple):
-    """A row's course (n, 2), half width and distance of two curtains in metres, and points: station, left, canopy 0–1.
-
-    Canopy is what stands above the level of its body, and that of its ridge.
-    """
+    """A row's share of a cloud: its course, and the m points near it."""
 
     curve: Values
+    """Stations (n, 2) of the course."""
     half: float
+    """Metres to both sides in which its canopy is looked for."""
     curtains: float
+    """Metres between the two curtains of its canopy; 0 where it has one."""
     station: Values
+    """How many stations (m,) along the course points are."""
     left: Values
+    """Metres (m,) to the left of it."""
     body: Values
+    """How far (m,) points are canopy, 0–1, by the level of canopies whole."""
     ridge: Values
+    """The same by that of what stands apart; ``body`` itself where both are alike."""
     known: Known | None
 
 
@@ -71,7 +75,28 @@ def deal(
     *,
     high: float,
 ) -> Iterator[tuple[Ints, list[Share]]]:
-    """Curves, and of each its share of the points near it, in its own frame."""
+    """Deal a cloud's points out to the rows that they are near, group by group of rows.
+
+    Parameters
+    ----------
+    cloud : PointCloud or TiledCloud
+        Points with their heights above ground.
+    vines, levels
+        As of :func:`where_vines_are`.
+    curves : sequence of (n, 2) array
+        Courses of the rows.
+    half, curtains, known
+        Of each, as of :class:`Share`.
+    high : float
+        Height in metres above which no point is canopy.
+
+    Yields
+    ------
+    rows : (k,) array
+        Positions of the group's curves.
+    shares : list of Share
+        Of each.
+    """
     touching = bool(levels.touching.any())
 
     def canopy_of(part: PointCloud, member: NDArray[np.int32]) -> Taken:

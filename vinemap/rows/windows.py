@@ -72,8 +72,8 @@ def one_way(peaks: Peaks, second: Peaks, drawn: Grain, *, least: float) -> tuple
     """Give plantings in a square, or a quincunx, where several directions are about as good, one a block; tell where.
 
     Rows run where vines are closer together, so that rows are farther apart; if both are alike, where rows are longer.
-    Only windows whose canopies aren't drawn out along one wave count, and so many of them, as wide as long: beside a
-    hedge there are fewer.
+    Only windows whose canopies aren't drawn out along one wave count, and only where there are ``least`` of them at the
+    least, in a block as wide as long: beside a hedge there are fewer.
     """
     side = max(1, int(np.sqrt(least)))
     either = drawn.clear < CLEAR

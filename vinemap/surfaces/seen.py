@@ -29,11 +29,13 @@ ROOM = 1.5
 
 
 class Seen(NamedTuple):
-    """Cells (ny, nx) of a grid, true where a cloud shows what is there, and of a fine one, true where it has points."""
+    """What a cloud shows: the ground on which it has points, and holes between them that are no wider than usual."""
 
     cells: Flags
+    """Cells (ny, nx) of ``grid`` that were seen."""
     grid: Grid
     points: Flags
+    """Cells of ``fine`` that have points."""
     fine: Grid
 
     def at(self, xy: Values) -> Flags:

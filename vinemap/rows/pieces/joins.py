@@ -34,6 +34,7 @@ class Ends(NamedTuple):
     """Both ends of every piece; ends 2 p and 2 p + 1 are those of piece p."""
 
     xy: Values
+    """Places (2 m, 2) of the ends, on the axes of their pieces."""
     middle: Values
     """Middles (2 m, 2) of the piece's last metres."""
     tangent: Values
@@ -41,6 +42,7 @@ class Ends(NamedTuple):
     field: Values
     """Outward unit vectors (2 m, 2) of the row field there."""
     spacing: Values
+    """Inter-row spacing (2 m,) in metres."""
     bend: Values
     """Curvature (2 m,) in 1/m on the way out, positive to the left; NaN where a piece is too short to tell."""
 

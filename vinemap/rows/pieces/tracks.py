@@ -60,13 +60,16 @@ STRIDE = 0.5
 
 
 class Gaps(NamedTuple):
-    """Gaps between two ends."""
+    """Gaps between two ends of rows."""
 
     middle: Values
+    """Places (k, 2) midway between the ends."""
     along: Values
-    """Unit vectors (k, 2)."""
+    """Unit vectors (k, 2) from one end to the other."""
     length: Values
+    """Metres (k,) between them."""
     spacing: Values
+    """Inter-row spacing (k,) in metres."""
 
 
 def gaps_between(a: Values, b: Values, spacing: Values) -> Gaps:

@@ -32,23 +32,24 @@ NOTHING = np.empty(0)
 
 
 class Standing(NamedTuple):
-    """Curve (n, 2), its runs of canopy (k, 2) in metres along it, and the canopy's contrast.
-
-    ``goes_on`` tells of either end whether it may go on: what it was cut from ends no vine's distance beyond it. Before
-    a row is cut, ``sides`` (k,) is the cover at both sides of each run, in that of its middle, and ``wide`` (k,) is its
-    width in that of the row's canopy. ``told`` says of either end whether canopy tells it, as it does unless the end is
-    known and nothing ends near it. ``half`` is the canopy's half width in metres, at half its cover and at the ``EDGE``
-    of it.
-    """
+    """A row with its canopy."""
 
     curve: Values
+    """Places (n, 2) along its middle."""
     runs: Values
+    """Stretches (k, 2) of it with canopy, in metres along it."""
     contrast: float
+    """Of the canopy to what stands beside it, 0–1."""
     goes_on: tuple[bool, bool] = (False, False)
+    """Whether the canopy may go on beyond either end: no more than a vine's distance was looked at there."""
     sides: Values = NOTHING
+    """Cover (k,) at both sides of each run, as a share of that of its middle; none once the row is cut."""
     wide: Values = NOTHING
+    """Width (k,) of each run, in that of the row's canopy; none once the row is cut."""
     told: tuple[bool, bool] = (True, True)
+    """Whether canopy tells where either end is: not where it is known, and nothing ends near there."""
     half: tuple[float, float] = (0.0, 0.0)
+    """Half width of the canopy in metres, where it has half of its cover and where it has the ``EDGE`` of it."""
 
     @property
     def length(self) -> float:
@@ -72,8 +73,18 @@ def find_canopy(
 ) -> Standing | None:
     """Find the canopy along a curve; None where there is none.
 
-    Images (stations, cells across) are of the canopy's cover along it; its ridge tells how it stands out. From so many
-    metres of full cover across on there may be canopy. What stands in cells that are other rows' is theirs.
+    Parameters
+    ----------
+    curve : (n, 2) array
+        Stations along the row.
+    image, ridge : (n, cells across) array
+        Cover along it: of the canopy whole, and of its ridge, which tells how it stands out.
+    end_share : float
+        Share of the cover thereabouts at which canopy begins and ends.
+    least : float
+        Metres of full cover across a station, below which it has no canopy.
+    theirs : (n, cells across) array, optional
+        Cells that are in other rows' canopies: what stands there isn't this row's.
     """
     across = image.mean(axis=0)
     core = _core(across)
@@ -117,9 +128,9 @@ def _own(image: Values, own: Flags) -> Values:
 
 
 def thereabouts(profile: Values, typical: float, *, around: float) -> Values:
-    """Cover (stations,) along a row thereabouts, where there is canopy at all: its last vine may be a weak one.
+    """Cover (stations,) that is usual around each station with canopy: a row's last vine may be a weak one.
 
-    Told are the cover that is typical of the row, and a standard deviation in stations.
+    ``typical`` is the cover that is usual in the whole row, ``around`` the standard deviation in stations.
     """
     living = np.clip((profile / typical - 0.2) / 0.2, 0, 1)
     near, weight = (gaussian_filter1d(v, around, mode="constant") for v in (profile * living, living))

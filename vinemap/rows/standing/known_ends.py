@@ -19,17 +19,18 @@ NEAR, SPREAD = 0.25, 4.0
 
 
 class Known(NamedTuple):
-    """What is known of a row: metres at which it begins and ends along the curve on which it is looked for.
-
-    Either may be off by up to ``slack`` metres; the course may be if it ``moves``. Canopy has ``least`` metres of full
-    cover across it.
-    """
+    """What is known of a row."""
 
     start: float
+    """Metres at which it begins, along the curve on which it is looked for."""
     end: float
+    """Metres at which it ends."""
     slack: float
+    """Metres by which either may be off."""
     moves: bool
+    """Whether its course may be off."""
     least: float
+    """Metres of full cover across it, below which there is no canopy."""
 
 
 def cut_as_known(rows: Sequence[Standing], known: Sequence[Known]) -> list[Standing]:

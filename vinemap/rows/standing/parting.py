@@ -33,14 +33,14 @@ ENDS = (False, True)
 
 
 class Parted(NamedTuple):
-    """A row that ran into others: its course (n, 2), carried on from where it stands free, and their canopies.
-
-    Beside it are others' curves, into which it didn't run.
-    """
+    """A row that ran into others."""
 
     course: Values
+    """Its course (n, 2), carried on from where it stands free of them."""
     theirs: shapely.Geometry
+    """Their canopies."""
     beside: list[Values]
+    """Curves (m, 2) of the rows beside it into which it didn't run."""
 
 
 class _Tip(NamedTuple):
