@@ -27,8 +27,6 @@ OURS = (KeyboardInterrupt, SystemExit, GeneratorExit)
 class Head(NamedTuple):
     """What the header of a file says of its layout: places and lengths in bytes, and numbers."""
 
-    minor: int
-    """Of its version of LAS, 1.minor."""
     encoding: int
     length: int
     """Of the header."""
@@ -110,7 +108,7 @@ def read_head(stream: IO[bytes]) -> Head | None:
     late_at, n_late = 0, 0
     if head[25] >= 4:
         late_at, n_late, n = struct.unpack("<QIQ", head[235:255])
-    return Head(head[25], encoding, length, points_at, n_records, kind, point_length, n, late_at, n_late, head[BOX])
+    return Head(encoding, length, points_at, n_records, kind, point_length, n, late_at, n_late, head[BOX])
 
 
 def _has_records(stream: IO[bytes], head: Head, size: int) -> bool:
