@@ -4,7 +4,6 @@ import pytest
 from click.testing import CliRunner
 
 from vinemap.cli.main import commands
-from vinemap.compute import extras
 from vinemap.errors import ConfigError
 from vinemap.simulate.survey import write_survey
 
@@ -13,7 +12,7 @@ from vinemap.simulate.survey import write_survey
 def say(vineyard, tmp_path, monkeypatch):
     """Runs a command in a folder that has a survey of parcel A; gives what it says."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(extras, "is_there", lambda module: False)
+    monkeypatch.setattr("vinemap.cli.estate.find_spec", lambda module: None)
     write_survey(vineyard, "data/surveys/small")
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "small.yaml").write_text("survey: small\nparcels: [A]\n")

@@ -52,14 +52,13 @@ def example() -> None:
 @click.option("--config", type=FILE, default=paths.EXAMPLE, help="Configuration; configs/barolo.yaml by default.")
 def parcel(parcel: str, config: Path) -> None:
     """Map one PARCEL of a configured survey, anew."""
-    from vinemap.compute.extras import is_there
     from vinemap.example import ready
     from vinemap.jobs.configured import map_one
 
     if config == paths.EXAMPLE and not config.is_file():
         raise ConfigError(f"{config}: no such file: vinemap example makes it, --config names another")
     survey, name = ready(config, parcel)
-    if is_there("prefect"):
+    if find_spec("prefect"):
         summary = flows("parcel").parcel_flow(survey.survey, name, survey)
     else:
         with progress(name) as step:
@@ -80,7 +79,6 @@ def nightly(config: Path, once: bool, every: float | None) -> None:
 
 def map_configured(name: str, *, again: bool) -> None:
     """Map the parcels of a configured survey that need it, and tell what became of them."""
-    from vinemap.compute.extras import is_there
     from vinemap.example import ensure_cloud
     from vinemap.jobs.configured import chosen
     from vinemap.jobs.survey import map_survey
@@ -88,7 +86,7 @@ def map_configured(name: str, *, again: bool) -> None:
 
     config, folder = chosen(name)
     ensure_cloud(config)
-    if is_there("prefect"):
+    if find_spec("prefect"):
         tell(flows("survey").outcomes_of(config, folder, again=again))
         return
     outcomes = []

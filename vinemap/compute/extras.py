@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 from vinemap.errors import DependencyError
@@ -28,11 +27,6 @@ EXTRAS = {
     "pyarrow": Extra("parquet", "pyarrow", "Parquet"),
 }
 """By the name of their module."""
-
-
-def is_there(module: str) -> bool:
-    """Whether an extra's library is installed, without loading it."""
-    return find_spec(module) is not None
 
 
 def load(module: str) -> Any:
