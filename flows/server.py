@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LOOPBACK = "127.0.0.1"
+PATIENCE = 180.0
+"""Seconds until a server must be ready."""
 
 
 @contextmanager
@@ -56,7 +58,7 @@ def home() -> Iterator[Path]:
 
 
 @contextmanager
-def server(api: str, folder: Path, *, patience: float = 180) -> Iterator[subprocess.Popen[bytes] | None]:
+def server(api: str, folder: Path) -> Iterator[subprocess.Popen[bytes] | None]:
     """Give a server that is ready: a process of ours, or None if one answers at that address already.
 
     Parameters
@@ -65,8 +67,6 @@ def server(api: str, folder: Path, *, patience: float = 180) -> Iterator[subproc
         Address of the server's interface, as in ``PREFECT_API_URL``.
     folder : Path
         For its database and its log.
-    patience : float
-        Seconds until it must be ready.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def server(api: str, folder: Path, *, patience: float = 180) -> Iterator[subproc
     log = folder / "server.log"
     process = _start(api, port, folder, log)
     try:
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + PATIENCE
         while not _ready(api):
             if process.poll() is not None or time.monotonic() > deadline:
                 raise VinemapError(f"the Prefect server doesn't start: see {log}")

@@ -243,8 +243,10 @@ def to_place(xyz: Floats, source: CRS, path: PurePath, place: Place, first: Pure
     return xyz
 
 
-def examined(xyz: Floats, header: Any, source: CRS, path: PurePath, *, given: bool = False) -> list[str]:
-    """What is to be known of where a file's points are, some of which (n, 3) are in its CRS, which may be given.
+def examined(xyz: Floats, header: Any, source: CRS, path: PurePath, *, given: bool) -> list[str]:
+    """What is to be known of where a file's points are: a sentence each.
+
+    Of the points some (n, 3) are looked at, in the file's CRS, which may be ``given`` instead of stated by it.
 
     Raises
     ------

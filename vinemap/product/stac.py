@@ -66,7 +66,7 @@ def parcel_item(
     polygon: shapely.Geometry,
     crs: CRS,
     properties: Mapping[str, Any],
-    survey: str | None = None,
+    survey: str | None,
 ) -> pystac.Item:
     """Describe the product of a parcel.
 

@@ -195,12 +195,12 @@ def foliage_of(stations: Stations, rows: int) -> Foliage:
     return Foliage(row, xy, step, top, bottom, stations.half_width[alive], stations.shift[alive])
 
 
-def foliage_outlines(foliage: Foliage, *, n: int = 24) -> Array:
-    """Outlines (stations, 2 n, 2) of the foliage across its rows, leaves' reach included: metres left and above ground.
+def foliage_outlines(foliage: Foliage) -> Array:
+    """Outlines (stations, 48, 2) of the foliage across its rows, leaves' reach included: metres left and above ground.
 
     They run counter-clockwise where what lies to the left is drawn to the right.
     """
-    relative = np.linspace(0, 1, n)
+    relative = np.linspace(0, 1, 24)
     reach = EDGE / 2
     width = foliage.half_width[:, None] * bulge(relative) + reach
     z = foliage.bottom[:, None] - reach + relative * (foliage.top - foliage.bottom + 2 * reach)[:, None]

@@ -45,7 +45,7 @@ ALIKE = 1e-5
 
 
 def other_chunks(
-    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str], *, engine: str = "vinemap"
+    path: Path, crs: CRS | None, around: Boundary | None, remarks: list[str], *, engine: str
 ) -> Generator[tuple[Floats, CRS]]:
     """Coordinates (n, 3) of a file's usable points, chunk by chunk, and their CRS; what is to be known is added.
 

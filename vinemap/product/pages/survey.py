@@ -132,7 +132,7 @@ def survey_page(
     products: Mapping[str, Product],
     told: Mapping[str, Mapping[str, Any]],
     *,
-    key: str = "",
+    key: str,
 ) -> str:
     """Page of a survey as one HTML file, which leads to its parcels' files by their relative paths.
 

@@ -111,7 +111,7 @@ def _colour(tag: str, colour: str) -> Element:
     return node(tag, red=red, green=green, blue=blue, alpha=alpha)
 
 
-def _font(size: float, *, bold: bool = False) -> str:
+def _font(size: float, *, bold: bool) -> str:
     return f"Sans Serif,{size:g},-1,5,{75 if bold else 50},0,0,0,0,0"
 
 
