@@ -21,6 +21,7 @@ from vinemap.evaluate.company import (
     stations_along,
     usually_apart,
 )
+from vinemap.geo.curve import cross
 from vinemap.geo.raster import Raster, cell_of, sample, sample_across
 from vinemap.surfaces.things import around_cells, roughness
 
@@ -63,12 +64,17 @@ def evidence(
 ) -> pd.DataFrame:
     """What speaks for rows, each from 0 to 1, and the share of their canopy's length that is ``cut`` at a side.
 
-    They are **company**, the share of the length along which another row runs beside it at the distance that is usual
-    for both, which tells less where most rows stand alone; **whole**, that it doesn't go on beyond its end where others
-    go on, nor crosses where those beside it end; **alike**, that its canopy isn't far wider for its height than theirs;
-    **claimed**, the share beside which no canopy stands where the next row ought to be; its **support**; its
-    **contrast**; its **length** in spacings; the **wave** of rows thereabouts, which bushes in no order hardly have;
-    that its course is **smooth**; and that its top is **rough**, as leaves are.
+    They are
+
+    - ``company``: the share of the length along which another row runs beside it at the distance that is usual for
+      both, which tells less where most rows stand alone;
+    - ``whole``: that it doesn't go on beyond its end where others go on, nor crosses where those beside it end;
+    - ``alike``: that its canopy isn't far wider for its height than those of the rows around;
+    - ``claimed``: the share of the length beside which no canopy stands where the next row ought to be;
+    - ``support``, ``contrast`` and ``length``, in spacings: its own;
+    - ``wave``: how plainly rows are a wave thereabouts, which bushes in no order hardly are;
+    - ``smooth``: that its course doesn't wander;
+    - ``rough``: that its top is rough, as leaves are.
 
     Parameters are as of :func:`vinemap.evaluate.confidence.judge_rows`; there is a row at the least.
     """
@@ -168,7 +174,7 @@ def _wandering(at: Stations) -> Values:
     first = np.arange(max(len(at.row) - k - 1, 0))
     first = first[at.row[first] == at.row[first + k + 1]]
     a, b = at.xy[first + k] - at.xy[first], at.xy[first + k + 1] - at.xy[first + 1]
-    turn = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], (a * b).sum(axis=1)) / STEP
+    turn = np.arctan2(cross(a, b), (a * b).sum(axis=1)) / STEP
     row, rows = at.row[first], len(at.start) - 1
     total = np.concatenate([[0.0], np.cumsum(turn)])
     n = np.bincount(row, minlength=rows)
