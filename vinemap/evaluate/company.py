@@ -10,6 +10,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap.compute.beside import nearest_beside
+from vinemap.geo.curve import cross, unit
 from vinemap.geo.raster import Raster, sample
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def stations_along(lines: Values) -> Stations:
     xy = shapely.get_coordinates(shapely.line_interpolate_point(lines[row], share, normalized=True))
     each = np.arange(start[-1])
     way = xy[np.minimum(each + 1, start[row + 1] - 1)] - xy[np.maximum(each - 1, start[row])]
-    return Stations(row, xy, way / np.maximum(np.hypot(*way.T), 1e-9)[:, None], start)
+    return Stations(row, xy, unit(way), start)
 
 
 def beside_each(at: Stations, block: Ints, reach: Values) -> Beside:
@@ -88,7 +89,7 @@ def beside_each(at: Stations, block: Ints, reach: Values) -> Beside:
 def _seen_from(xy: Values, tangent: Values, other: Values) -> tuple[Values, Values]:
     """Metres along a direction and to its left at which others lie."""
     way = other - xy
-    return (way * tangent).sum(axis=-1), tangent[..., 0] * way[..., 1] - tangent[..., 1] * way[..., 0]
+    return (way * tangent).sum(axis=-1), cross(tangent, way)
 
 
 def usually_apart(at: Stations, beside: Beside) -> Values:
@@ -136,8 +137,7 @@ def goes_on(at: Stations, usual: Values, chm: Raster, seen: Seen, high: float) -
     backwards, forwards = np.maximum(ends - back, at.start[row]), np.minimum(ends + back, at.start[row + 1] - 1)
     inner = np.where(np.arange(len(ends)) % 2, backwards, forwards)
     xy = at.xy[ends]
-    outward = xy - at.xy[inner]
-    outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
+    outward = unit(xy - at.xy[inner])
     pairs = cKDTree(xy).query_pairs(LONGEST_GAP, output_type="ndarray")
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
     gap, across = _seen_from(xy[i], outward[i], xy[j])

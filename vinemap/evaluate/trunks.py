@@ -9,6 +9,7 @@ import shapely
 
 from vinemap.evaluate.planting import Places
 from vinemap.geo.crs import project
+from vinemap.geo.curve import unit
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -79,13 +80,11 @@ def _places(xy: Values, lines: Lines) -> tuple[Ints, Values, Values, Values]:
     points = np.asarray(shapely.points(xy))
     row = np.asarray(shapely.STRtree(lines).nearest(points))
     position = shapely.line_locate_point(lines[row], points)
-    away = xy - shapely.get_coordinates(shapely.line_interpolate_point(lines[row], position))
     length = shapely.length(lines)[row]
     inner = np.clip(position + np.where(position <= 0, 1.0, -1.0), 0, length)
-    way = shapely.get_coordinates(shapely.line_interpolate_point(lines[row], position))
-    way = way - shapely.get_coordinates(shapely.line_interpolate_point(lines[row], inner))
-    way /= np.maximum(np.hypot(*way.T), 1e-9)[:, None]
-    beyond = np.where((position <= 0) | (position >= length), (away * way).sum(axis=1), 0.0)
+    foot, back = (shapely.get_coordinates(shapely.line_interpolate_point(lines[row], p)) for p in (position, inner))
+    away = xy - foot
+    beyond = np.where((position <= 0) | (position >= length), (away * unit(foot - back)).sum(axis=1), 0.0)
     return row, position, beyond, np.hypot(*away.T)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from vinemap.export.neighbours import STEP, aligned, belonging, look, pair_rows
-from vinemap.geo.curve import extend, way_along
+from vinemap.geo.curve import extend, unit, way_along
 from vinemap.geo.holes import comes_back, room_before, way_out
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def _inside(
     else:
         row = lines[(right or left)[0]]
         foot = shapely.get_coordinates(shapely.line_interpolate_point(row, shapely.line_locate_point(row, _points(xy))))
-        away = (xy - foot) / np.maximum(np.hypot(*(xy - foot).T), 1e-9)[:, None]
+        away = unit(xy - foot)
         rays = np.asarray(shapely.linestrings(np.stack([foot, xy + way_out(within) * away], axis=1)), dtype=object)
         free |= ~comes_back(rays, within)
     if free.all():

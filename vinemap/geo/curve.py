@@ -89,6 +89,18 @@ def across(curve: Values, offsets: Values, *, smoothing: float) -> Values:
     return out
 
 
+def unit(ways: Values) -> Values:
+    """Unit vectors (n, 2) of the directions of vectors (n, 2); those of no length stay as they are."""
+    out: Values = ways / np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
+    return out
+
+
+def cross(one: Values, other: Values) -> Values:
+    """Cross products (…,) of vectors (…, 2): positive where the other one points to the left."""
+    out: Values = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+    return out
+
+
 def way_along(curve: Values) -> Values:
     """Metres (n,) from the start of a curve (n, 2) to each of its points."""
     return _way(np.ascontiguousarray(curve, dtype=np.float64))

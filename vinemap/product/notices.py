@@ -12,7 +12,7 @@ from vinemap.evaluate.changes import ASIDE, are_others, lie_aside
 from vinemap.evaluate.confidence import DOUBTFUL
 from vinemap.evaluate.unmapped import ALONE, LOW, ROWLESS, TALL, WIDE
 from vinemap.geo.crs import project
-from vinemap.geo.curve import across, at_each, resample, tangents_of_each
+from vinemap.geo.curve import across, at_each, cross, resample, tangents_of_each
 from vinemap.geo.raster import block_sum, cell_of
 from vinemap.rows.curtains import CLOSE
 from vinemap.rows.standing.gaps import UNSEEN
@@ -108,7 +108,7 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
         return []
     chords = np.array([np.subtract(*shapely.get_coordinates(line)[[-1, 0]]) for line in rows.geometry])
     along = chords / np.linalg.norm(chords, axis=1)[:, None]
-    aside = np.abs(along[:, 0] * shift.metres[1] - along[:, 1] * shift.metres[0])
+    aside = np.abs(cross(along, shift.metres))
     if not (aside > MISTAKEN * rows["spacing_m"]).any():
         return []
     remark = (

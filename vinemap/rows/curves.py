@@ -17,7 +17,7 @@ from scipy.sparse.linalg import matrix_power
 
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads
-from vinemap.geo.curve import between, extend, normals, resample, turn_between
+from vinemap.geo.curve import between, cross, extend, normals, resample, turn_between
 from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import centre_line, half_width, runs_above, whittaker
 from vinemap.rows.standing.canopy import thereabouts
@@ -233,7 +233,7 @@ def _turn(curve: Values) -> float:
     """Angle in radians between the first and the last third of a curve."""
     k = max(1, len(curve) // 3)
     first, last = curve[k] - curve[0], curve[-1] - curve[-1 - k]
-    return abs(float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last)))
+    return abs(float(np.arctan2(cross(first, last), first @ last)))
 
 
 def _repeated(rows: gpd.GeoDataFrame) -> Flags:

@@ -15,7 +15,7 @@ import shapely
 from scipy.ndimage import gaussian_filter1d
 
 from vinemap.compute.threads import in_threads
-from vinemap.geo.curve import normals, resample
+from vinemap.geo.curve import normals, resample, unit
 from vinemap.geo.layers import some_of
 from vinemap.geo.raster import Raster, sample_across
 from vinemap.rows.centre_line import whittaker
@@ -179,8 +179,7 @@ def _wave(line: shapely.LineString, spacing: float, cover: Raster) -> _Wave:
 def _thereabouts(shapes: Values, spacing: Values) -> Values:
     """Pairs (3, k) of lines that are near each other and parallel, themselves included: two indices and their sense."""
     ends = shapely.get_coordinates(shapely.line_interpolate_point(shapes[:, None], [[0, 1]], normalized=True))
-    chord = np.diff(ends.reshape(-1, 2, 2), axis=1)[:, 0]
-    chord /= np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
+    chord = unit(np.diff(ends.reshape(-1, 2, 2), axis=1)[:, 0])
     i, j = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=THEREABOUTS * spacing)
     sense = (chord[i] * chord[j]).sum(axis=1)
     near = (np.abs(sense) >= PARALLEL) | (i == j)

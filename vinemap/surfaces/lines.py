@@ -11,7 +11,7 @@ import shapely
 
 from vinemap.errors import InputError
 from vinemap.geo.crs import project
-from vinemap.geo.curve import resample
+from vinemap.geo.curve import cross, resample, unit
 from vinemap.geo.layers import some_of
 
 if TYPE_CHECKING:
@@ -98,13 +98,12 @@ def space_lines(lines: gpd.GeoDataFrame, field: RowField | None = None) -> gpd.G
         shapely.line_interpolate_point(shapes[:, None], share + step, normalized=True).ravel()
         for step in (-0.05, 0.0, 0.05)
     )
-    way = shapely.get_coordinates(ahead) - shapely.get_coordinates(back)
-    way /= np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+    way = unit(shapely.get_coordinates(ahead) - shapely.get_coordinates(back))
     point, other = shapely.STRtree(shapes).query(points, predicate="dwithin", distance=FAR)
     foot = shapely.get_coordinates(shapely.shortest_line(points[point], shapes[other])).reshape(-1, 2, 2)
     there = foot[:, 1] - foot[:, 0]
     along = (way[point] * there).sum(axis=1)
-    left = way[point, 0] * there[:, 1] - way[point, 1] * there[:, 0]
+    left = cross(way[point], there)
     abreast = np.abs(along) <= SLANT * np.abs(left) + 1e-6
     places = pd.Series(left[abreast]).groupby(point[abreast])
     steps = places.apply(lambda one: _usual_step(one.to_numpy())).reindex(range(len(points)))

@@ -9,6 +9,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from vinemap.canopy.numbers import modelling_indices, summarise_rows
+from vinemap.geo.curve import cross
 from vinemap.simulate.plants import foliage_outlines
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def _against_truth(foliage: Foliage, outlines: Floats, model: CanopyModel) -> tu
     at, tangent = nearest[known], canopy.tangent[known]
     away = foliage.xy[at] - canopy.origin[known, :2]
     outlines = outlines[at]
-    outlines[:, :, 0] += (tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0])[:, None]
+    outlines[:, :, 0] += cross(tangent, away)[:, None]
     true, polygons = shapely.make_valid(shapely.polygons(outlines)), shapely.polygons(model.polygons[known])
     polygons = shapely.make_valid(polygons)
     areas = [np.asarray(shapely.area(p)) for p in (shapely.intersection(true, polygons), polygons, true)]

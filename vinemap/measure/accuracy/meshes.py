@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.canopy.numbers import judge_canopies, summarise_rows
 from vinemap.evaluate.meshes import PATCH, distances, measure_meshes
+from vinemap.geo.curve import cross
 from vinemap.simulate.plants import foliage_outlines
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def _beside(points: Floats, model: CanopyModel) -> tuple[Floats, Ints]:
         return np.empty((0, 3)), np.empty(0, dtype=np.int64)
     section = cKDTree(model.at.origin[:, :2]).query(points[:, :2])[1]
     away, way = points[:, :2] - model.at.origin[section, :2], model.at.tangent[section]
-    along, left = (away * way).sum(axis=1), way[:, 0] * away[:, 1] - way[:, 1] * away[:, 0]
+    along, left = (away * way).sum(axis=1), cross(way, away)
     chosen = np.flatnonzero((np.abs(along) <= PATCH / 2) & (np.abs(left) < model.at.spacing[section] / 2))
     chosen = chosen[np.argsort(section[chosen], kind="stable")]
     return points[chosen], section[chosen]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
+from vinemap.geo.curve import cross
 from vinemap.rows.pieces.kinks import KINK, SHORT, TANGENT_LENGTH
 from vinemap.rows.pieces.tracks import blocked, gaps_between, on_tracks
 
@@ -71,8 +72,7 @@ def ends_of(xy: Values, direction: Values, spacing: Values, pieces: Ints, positi
             out.spacing[end] = np.median(spacing[near])
             if s[-1] >= BEND_LENGTH:
                 offset = xy[members[depth <= BEND_LENGTH]] - middle
-                left = tangent[0] * offset[:, 1] - tangent[1] * offset[:, 0]
-                out.bend[end] = 2 * np.linalg.lstsq(np.vander(offset @ tangent, 3), left)[0][0]
+                out.bend[end] = 2 * np.linalg.lstsq(np.vander(offset @ tangent, 3), cross(tangent, offset))[0][0]
     return out
 
 
@@ -99,8 +99,7 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
 
     def mismatch(at: Values, outward: Values) -> Values:
         way, turn = at[b] - at[a], outward[a] - outward[b]
-        out: Values = np.abs(turn[:, 0] * way[:, 1] - turn[:, 1] * way[:, 0]) / 2
-        return out
+        return np.abs(cross(turn, way)) / 2
 
     lateral = np.minimum(mismatch(ends.xy, ends.tangent), mismatch(ends.middle, ends.field))
     ahead = np.minimum((ends.field[a] * gap).sum(axis=1), -(ends.field[b] * gap).sum(axis=1))
@@ -108,7 +107,7 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
     facing = (ahead >= STRAIGHT * length - OVERLAP) & (against > STRAIGHT)
     gate = np.minimum(0.25 + 0.05 * length, 0.36 * np.minimum(ends.spacing[a], ends.spacing[b]))
     fits = facing & (lateral <= gate) & ~_kinked(ends, a, b, length)
-    aside = np.stack([_cross(ends.tangent[a], gap), _cross(gap, -ends.tangent[b])])
+    aside = np.stack([cross(ends.tangent[a], gap), cross(gap, -ends.tangent[b])])
     meet = (
         (np.maximum(aside.min(axis=0), -aside.max(axis=0)) >= -gate)
         & (ahead >= BENT * length - OVERLAP)
@@ -120,11 +119,6 @@ def candidates(ends: Ends, max_gap: float, beside: Callable[..., tuple[int, int]
         fits[k] = through > 1 and ended <= 2 * through
     cost = length[fits] + 10 * lateral[fits]
     out: Ints = pairs[fits][np.lexsort((cost, single[fits]))]
-    return out
-
-
-def _cross(one: Values, other: Values) -> Values:
-    out: Values = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
     return out
 
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
+from vinemap.geo.curve import cross
+
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
@@ -63,7 +65,7 @@ def _kinks(xy: Values, position: Values) -> Values:
         curve[np.minimum(here + k, len(along) - 1)] - curve[here],
     )
     turn = np.zeros(len(along))
-    turn[here] = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
+    turn[here] = np.arctan2(cross(before, after), (before * after).sum(axis=1))
     padded = np.pad(turn, k)
     sides = np.stack([padded[: -2 * k], padded[2 * k :]])
     bend = sides.sum(axis=0) / np.maximum(np.count_nonzero(sides, axis=0), 1)

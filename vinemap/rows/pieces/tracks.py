@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from vinemap.compute.links import parts_of
 from vinemap.compute.threads import in_threads
+from vinemap.geo.curve import cross
 from vinemap.geo.raster import sample, sample_across
 from vinemap.rows.centre_line import runs_above
 
@@ -167,8 +168,7 @@ def _side_by_side(gaps: Gaps, aslant: float) -> tuple[Ints, Ints, Values]:
 def _in_frame(gaps: Gaps, one: Ints | np.intp, other: Ints) -> tuple[Values, Values]:
     """Middles of other gaps from one or as many: metres along its row, and spacings to the left."""
     way, along = gaps.middle[other] - gaps.middle[one], gaps.along[one]
-    left = along[..., 0] * way[:, 1] - along[..., 1] * way[:, 0]
-    return (way * along).sum(axis=1), left / gaps.spacing[one]
+    return (way * along).sum(axis=1), cross(along, way) / gaps.spacing[one]
 
 
 def _leads_out(tree: cKDTree, gaps: Gaps, lane: Ints, track_width: float) -> bool:
@@ -200,7 +200,7 @@ def _beyond(tree: cKDTree, gaps: Gaps, k: np.intp, track_width: float) -> list[t
     middle, along, length, spacing = gaps.middle[k], gaps.along[k], float(gaps.length[k]), float(gaps.spacing[k])
     around = np.hypot(length / 2 + FLANK, (ACROSS + 1) * spacing)
     near = tree.data[tree.query_ball_point(middle, around)] - middle
-    x, y = near @ along, (along[0] * near[:, 1] - along[1] * near[:, 0]) / spacing
+    x, y = near @ along, cross(along, near) / spacing
     y = y[(np.abs(x) > length / 2) & (np.abs(x) < length / 2 + FLANK)]
     far = _open_across(tree, middle, along, length, spacing, _keeps(track_width, spacing))
     out = []

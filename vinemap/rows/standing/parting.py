@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
-from vinemap.geo.curve import across, at, between, resample, way_along
+from vinemap.geo.curve import across, at, between, cross, resample, unit, way_along
 from vinemap.geo.raster import sample
 from vinemap.rows.centre_line import CELL, smooth_course
 
@@ -57,11 +57,10 @@ def own_rows(rows: Mapping[int, Standing]) -> dict[int, Standing]:
     """
     standing, held = list(rows.values()), np.ones(len(rows), dtype=bool)
     lines = np.array([shapely.LineString(row.curve) for row in standing], dtype=object)
-    chord = np.array([row.curve[-1] - row.curve[0] for row in standing]).reshape(-1, 2)
-    chord /= np.maximum(np.hypot(*chord.T), 1e-9)[:, None]
+    chord = unit(np.array([row.curve[-1] - row.curve[0] for row in standing]).reshape(-1, 2))
     canopies = shapely.buffer(lines, [row.half[1] for row in standing], cap_style="flat")
     one, other = shapely.STRtree(canopies).query(lines, predicate="intersects")
-    aslant = np.abs(chord[one, 0] * chord[other, 1] - chord[one, 1] * chord[other, 0]) > ASLANT
+    aslant = np.abs(cross(chord[one], chord[other])) > ASLANT
     one, other = one[aslant], other[aslant]
     for k in sorted(set(one.tolist()), key=lambda k: standing[k].length):
         own = shapely.union_all([shapely.LineString(between(standing[k].curve, *run)) for run in standing[k].runs])
