@@ -64,3 +64,11 @@ def assert_refused(done, *words):
     for word in words:
         assert word in done.stderr
     assert done.stdout == ""
+
+
+def gone(process):
+    """Whether no such process runs, though it may not have been buried."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True

@@ -39,6 +39,12 @@ def vineyard():
 
 
 @pytest.fixture(scope="session")
+def survey(vineyard, tmp_path_factory):
+    """The same as a file, with its polygons and its truth beside it."""
+    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
+
+
+@pytest.fixture(scope="session")
 def cloud(vineyard):
     return PointCloud(vineyard.xyz, parse_crs("EPSG:32632"))
 

@@ -6,11 +6,10 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-from commands import free_of_prefect, here, python
+from commands import free_of_prefect, gone, here, python
 
 from flows.server import server
 from vinemap.compute.processes import descendants
@@ -31,13 +30,6 @@ def wait(condition, *, patience=120):
         assert time.monotonic() < deadline, "it never came true"
         time.sleep(0.1)
     return found
-
-
-def gone(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 class Place:

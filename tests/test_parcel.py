@@ -35,11 +35,6 @@ RASTERS = ("dtm", "chm", "row_direction", "row_spacing", "vineyard_likelihood")
 
 
 @pytest.fixture(scope="module")
-def survey(vineyard, tmp_path_factory):
-    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
-
-
-@pytest.fixture(scope="module")
 def product(survey, tmp_path_factory):
     folder = tmp_path_factory.mktemp("products") / "A"
     boundary = survey.parent / "parcels.gpkg"

@@ -18,14 +18,8 @@ from squares import write_cloud
 from vinemap.cli import doctor
 from vinemap.cli.track import track
 from vinemap.config.settings import OdometryOptions
-from vinemap.simulate.survey import write_survey
 from vinemap.stages import STAGES
 from vinemap.terminal import progress
-
-
-@pytest.fixture(scope="module")
-def survey(vineyard, tmp_path_factory):
-    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
 
 
 def test_run_and_evaluate(tmp_path, survey):

@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from lasfiles import in_order
 from pyproj import CRS, Transformer
 from systems import POSIX
 
@@ -47,10 +48,6 @@ def survey(tmp_path):
     (tmp_path / "tiles").mkdir()
     parts = [write(tmp_path / "tiles" / f"{k}.laz", points[west == k]) for k in (1, 0)]
     return Survey(points, sorted(parts))
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.T)]
 
 
 def test_tiles_are_read_as_one(survey, tmp_path):

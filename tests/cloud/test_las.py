@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 import pytest
 import shapely
-from lasfiles import write_copc
+from lasfiles import in_order, write_copc
 from pyproj import CRS, Transformer
 
 from vinemap.cloud import copc, las
@@ -43,10 +43,6 @@ def test_reads_las_and_laz(tmp_path, points, suffix):
     cloud = read_cloud(write_las(tmp_path / f"a.{suffix}", points))
     assert cloud.crs == UTM
     assert np.allclose(cloud.xyz, points, atol=0.0006)
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.round(3).T)]
 
 
 def index_of(path):

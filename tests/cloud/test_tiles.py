@@ -10,6 +10,7 @@ import pytest
 import rasterio
 import shapely
 from commands import python
+from lasfiles import in_order
 from pyproj import CRS
 from systems import POSIX
 
@@ -25,7 +26,6 @@ from vinemap.geo.place import Place
 from vinemap.geo.raster import grid_over, squares, window
 from vinemap.parcel import map_parcel
 from vinemap.product.gltf import read_glb
-from vinemap.simulate.survey import write_survey
 from vinemap.stages import call
 from vinemap.surfaces.canopy_height import canopy_height_model
 from vinemap.surfaces.ground import terrain_model
@@ -47,10 +47,6 @@ def tiled(xyz, folder, *, chunk=30_000, block=1.0):
 
 def points_of(cloud):
     return np.concatenate([part.xyz for part in cloud.parts()])
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.T)]
 
 
 def on_millimetres(n, *, seed=0, width=150.0):
@@ -234,11 +230,6 @@ def assert_same_table(mine, theirs):
         )
     plain = [table.drop(columns="geometry") for table in (mine, theirs)]
     pd.testing.assert_frame_equal(*plain, check_exact=False, rtol=1e-6, atol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def survey(vineyard, tmp_path_factory):
-    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
 
 
 IN_TILES = Settings(reading=ReadingOptions(max_points=1000))

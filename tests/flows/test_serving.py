@@ -11,7 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from place import Place, gone, wait
+from commands import gone
+from place import Place, wait
 
 from vinemap.compute.processes import descendants
 

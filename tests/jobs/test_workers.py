@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from commands import gone
 from systems import LINUX, POSIX
 
 from vinemap.errors import WorkerError
@@ -36,14 +37,6 @@ def until(holds):
     while not holds():
         assert time.monotonic() < deadline, "it took too long"
         time.sleep(0.01)
-
-
-def gone(process):
-    """Whether no such process runs, though it may not have been buried."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 def test_calls_run_one_after_the_other_in_one_process(worker):

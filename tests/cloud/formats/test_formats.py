@@ -6,6 +6,7 @@ import formats
 import numpy as np
 import pytest
 import shapely
+from lasfiles import in_order
 from pyproj import CRS
 
 from vinemap import paths
@@ -26,10 +27,6 @@ HEAD = "element camera 2\nproperty float x\nproperty int k\n"
 def points():
     low, high = (414_700, 4_940_700, 460), (414_760, 4_940_750, 470)
     return np.random.default_rng(0).uniform(low, high, (4_000, 3)).round(3)
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.round(3).T)]
 
 
 WRITERS = {

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from lasfiles import UTM, write_copc
+from lasfiles import UTM, in_order, write_copc
 from laspy.copc import Bounds, CopcReader, load_octree_for_query
 from servers import serving
 
@@ -44,10 +44,6 @@ def hasty(monkeypatch):
 
 def address(server, name="a.copc.laz"):
     return Path(f"{server.url}/{name}")
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.round(3).T)]
 
 
 def test_only_what_lies_about_the_boundary_is_fetched(folder):

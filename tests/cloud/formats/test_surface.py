@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from lasfiles import in_order
 from pyproj import CRS
 
 from vinemap.cloud.formats import surface
@@ -16,10 +17,6 @@ from vinemap.errors import EmptyError, InputError
 from vinemap.parcel import map_parcel
 
 UTM = CRS.from_epsg(32632)
-
-
-def in_order(xyz):
-    return xyz[np.lexsort(xyz.round(3).T)]
 
 
 def test_a_surface_model_is_a_point_a_pixel(tmp_path):

@@ -21,15 +21,9 @@ from vinemap.jobs import survey as job
 from vinemap.jobs.plan import plan_survey
 from vinemap.parcel import map_parcel
 from vinemap.product.recipe import recipe_of
-from vinemap.simulate.survey import write_survey
 
 PDAL = GroundOptions(engine="pdal")
 WITH_PDAL = Settings(ground=PDAL)
-
-
-@pytest.fixture(scope="module")
-def survey(vineyard, tmp_path_factory):
-    return write_survey(vineyard, tmp_path_factory.mktemp("survey"))
 
 
 @pytest.mark.parametrize("most", [None, 40_000])
