@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
     points, behind = int.from_bytes(data[96:100], "little"), int.from_bytes(data[235:243], "little")
     (folder / "plain.laz").write_bytes(data.replace(b"copc", b"cops"))
     (folder / "nowhere.laz").write_bytes(data.replace(b"LASF_Projection", b"LASF_Elsewhere."))
-    (folder / "damaged.laz").write_bytes(data[: points + 40].ljust(behind, b"\xff") + data[behind:])
+    (folder / "damaged.laz").write_bytes(data[: points + 40].ljust(behind, b"\x01") + data[behind:])
     return folder
 
 
