@@ -68,7 +68,7 @@ def bare(cloud: Path) -> str:
 
 
 def stem(cloud: Path) -> str:
-    """That name, fit to name other files."""
+    """Name of a cloud without what tells its format, fit to name other files."""
     return plain(bare(cloud))
 
 

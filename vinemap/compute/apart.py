@@ -75,7 +75,7 @@ def _answer(process: subprocess.Popen[bytes], said: IO[bytes]) -> tuple[int, Any
 
 
 def serve() -> None:
-    """Be that process: call the one function that comes in, and pass on what it gives."""
+    """Be the process that :func:`apart` starts: call the one function that comes in, and pass on what it gives."""
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print must not get among the answers
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches this one too, but its parent ends it

@@ -84,7 +84,7 @@ def _folder() -> tuple[Path | None, bool]:
 
 
 def _hash(package: Path) -> str:
-    """Of all files of a package that hold compiled functions."""
+    """Hash of all files of a package that hold compiled functions."""
     digest = hashlib.sha256()
     for path in sorted(package.glob("*/*.py")):
         source = path.read_bytes()

@@ -39,7 +39,7 @@ class Corner(NamedTuple):
 
     @property
     def alt(self) -> float:
-        """Its height (m), as an :class:`Origin` tells it."""
+        """Height in metres, by the name that it has in an :class:`Origin`."""
         return self.z
 
 

@@ -190,7 +190,7 @@ def sample_across(
 
 
 def _plain(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The same, of any shape, as compiled code wants it: of double precision, in one piece."""
+    """Values of any shape as compiled code wants them: of double precision, in one piece."""
     return np.ascontiguousarray(values, dtype=np.float64)
 
 

@@ -134,7 +134,7 @@ def _hint(header: Any) -> str:
 
 
 def _records(header: Any) -> list[Any]:
-    """Those of a header that tell of coordinates."""
+    """Records of a header that tell of coordinates."""
     return [*header.vlrs.get_by_id("LASF_Projection"), *(header.evlrs or ())]
 
 

@@ -143,7 +143,7 @@ def _copy(xyz: Floats, p: int, out: Floats, place: Ints, zone: int) -> None:
 def points_near(
     points: gpd.GeoSeries, boundaries: Mapping[str, Boundary | None], *, reach: float
 ) -> dict[str, gpd.GeoSeries]:
-    """Those of some points that lie within each boundary, or no more than so many metres beside it.
+    """Points that lie within each boundary, or no more than so many metres beside it.
 
     Parameters
     ----------

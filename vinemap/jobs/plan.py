@@ -51,7 +51,7 @@ class Outcome:
     """Of the recipe."""
 
     def line(self) -> str:
-        """The same as a sentence."""
+        """What became of the parcel, as a sentence."""
         what = f"{in_words(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
         colon = "; " if self.state == DONE else ": "
         return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
@@ -62,7 +62,7 @@ COLUMNS = ("parcel", "rows", "seconds", "state", "reason")
 
 
 def in_table(outcomes: Iterable[Outcome]) -> list[tuple[str, ...]]:
-    """Rows of that table, in words."""
+    """What became of parcels in words, as rows of a table of ``COLUMNS``."""
     return [(o.parcel, str(o.rows), f"{o.seconds:.1f}", o.state, " ".join(o.reason.split())) for o in outcomes]
 
 
@@ -277,7 +277,7 @@ def _whole(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Parc
 
 
 def _bounds(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Boundary | None]:
-    """Boundaries of those."""
+    """Boundaries of the parcels whose polygons could be read; None of those that need none."""
     return {name: one.boundary if one else None for name, one in _whole(polygons).items()}
 
 

@@ -238,7 +238,7 @@ class _Packed:
 
 
 def _properties(part: Any) -> dict[str, Any]:
-    """Those of a part of a glTF document that are told."""
+    """Properties of a part of a glTF document, but for what is empty."""
     return {name: value for name, value in _known(vars(part)).items() if value not in ({}, [])}
 
 

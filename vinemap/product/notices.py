@@ -95,7 +95,7 @@ def notices(
 
 
 def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
-    """That a flight lies so far aside of known rows that each may be taken for the next.
+    """A remark if a flight lies so far aside of known rows that each may be taken for the next.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def shift_notices(shift: Shift | None, rows: gpd.GeoDataFrame) -> list[str]:
 
 
 def pair_notices(rows: gpd.GeoDataFrame) -> list[str]:
-    """That rows stand in pairs, of which each may be one row of two curtains.
+    """A remark if rows stand in pairs, of which each may be one row of two curtains.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def pair_notices(rows: gpd.GeoDataFrame) -> list[str]:
 
 
 def ground_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
-    """That no ground is seen between rows, as where it was taken out of a cloud.
+    """A remark if no ground is seen between rows, as where it was taken out of a cloud.
 
     Parameters
     ----------
@@ -180,14 +180,14 @@ def ground_notices(rows: gpd.GeoDataFrame, chm: Raster) -> list[str]:
 
 
 def change_notices(kept: Mapping[str, str]) -> list[str]:
-    """That files of an earlier product stay, by another name, as somebody has changed them: a sentence each."""
+    """A remark for each file of an earlier product that stays, by another name, as somebody has changed it."""
     return [
         f"{name} was changed since it was made: it stays beside the new one, as {other}" for name, other in kept.items()
     ]
 
 
 def _doubtful_canopies(rows: gpd.GeoDataFrame) -> list[str]:
-    """That heights, widths and volumes of rows aren't to be trusted, whose canopies weren't seen well."""
+    """A remark if canopies of rows weren't seen well enough to trust their heights, widths and volumes."""
     doubtful = int((rows["canopy_confidence"] < DOUBTFUL).sum())
     remark = (
         f"heights, widths and volumes of {doubtful} of {len(rows)} rows are doubtful: their canopies were seen too "

@@ -276,7 +276,7 @@ def fit_for(settings: Settings, clouds: Sequence[Path]) -> Settings:
 
 
 def vines_of(points: gpd.GeoSeries, parcels: Mapping[str, Boundary | None]) -> dict[str, gpd.GeoSeries]:
-    """Those of known vines that stand in each parcel, or just beside it, as boundaries may follow outermost rows."""
+    """Known vines that stand in each parcel, or just beside it, as boundaries may follow outermost rows."""
     return points_near(points, parcels, reach=BESIDE)
 
 

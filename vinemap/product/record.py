@@ -55,7 +55,7 @@ class Summary(NamedTuple):
     warnings: tuple[str, ...] = ()
 
     def line(self) -> str:
-        """The same as a sentence."""
+        """What a run found, as a sentence."""
         remarks = "".join(f"; {warning}" for warning in self.warnings)
         return f"{self.parcel}: {in_words(self.rows, self.length)}, in {self.seconds:.1f} s → {self.folder}{remarks}"
 

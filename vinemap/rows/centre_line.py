@@ -174,10 +174,10 @@ def _smoothed(values: Values, weights: Values, cutoff: float) -> Values:
 
 @compiled
 def _whittaker(values: Values, weights: Values, cutoff: float, slope: float, ridge: float) -> Values:
-    """The same, where wanted with first differences, and drawn to zero in gaps by a ridge, a share of the mean weight.
+    """What :func:`whittaker` does, with penalties on first differences and on values in gaps, too.
 
     ``slope`` is a wavelength for first differences: with it, a short stretch between gaps can't take a slope of its
-    own.
+    own. ``ridge``, a share of the mean weight, draws values to zero in gaps.
     """
     if len(values) < 3:
         return values.copy()

@@ -146,7 +146,7 @@ def with_curtains(nodes: Values, cells: Ints, found: Values, step: float) -> Val
 
 
 def curtain_remarks(courses: gpd.GeoDataFrame) -> list[str]:
-    """That rows were taken for such of two curtains by their distances alone: pairs of rows have the same.
+    """A remark if rows were taken for such of two curtains by their distances alone, as pairs of rows have the same.
 
     Parameters
     ----------

@@ -140,7 +140,7 @@ def _parted(
     dealt: _Dealt,
     fitted: _Fitted,
 ) -> dict[int, Standing]:
-    """Those of the rows that end in the canopies of others, without what isn't theirs."""
+    """Rows that end in the canopies of others, fitted anew without what is these others'."""
     out, places = {}, list(rows)
     for n, parted in part_rows(list(rows.values()), spacing[places], cover, margin=MARGIN).items():
         k, curves = places[n], [parted.course, *parted.beside]

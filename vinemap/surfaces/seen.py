@@ -44,7 +44,7 @@ class Seen(NamedTuple):
         return out
 
     def without(self, cells: Flags, grid: Grid) -> Seen:
-        """The same but for what lies beneath cells (ny, nx) of a grid."""
+        """What a cloud shows but for what lies beneath cells (ny, nx) of a grid."""
         here, of_points = (~spread(cells, grid, own) for own in (self.grid, self.fine))
         return self._replace(cells=self.cells & here, points=self.points & of_points)
 

@@ -59,7 +59,7 @@ def usual_height(chm: Raster, high: float) -> Values:
 
 
 def _tops(chm: Raster, high: float, order: float) -> Values:
-    """That order of the heights in squares (ny, nx) of ``AROUND`` metres; 0 where there is nothing."""
+    """An order of the heights up to a highest in squares (ny, nx) of ``AROUND`` metres; 0 where there is nothing."""
     squares = _squares(chm.grid)
     ny, nx = (-(-n // squares) for n in chm.grid.shape)
     padded = np.full((ny * squares, nx * squares), np.nan, dtype=np.float32)

@@ -84,7 +84,7 @@ def show(scene: Scene, png: Path | None = None) -> None:
 
 
 def draw() -> NoReturn:
-    """Be that process: draw what the file of its first argument holds, to that of the second, if there is one."""
+    """Be the process that draws what the file of its first argument holds, to that of its second or on the screen."""
     with np.load(sys.argv[1]) as arrays:
         sys.exit(not _draw(dict(arrays), sys.argv[2] if len(sys.argv) > 2 else None))
 

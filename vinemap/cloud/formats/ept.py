@@ -43,7 +43,7 @@ class _Key(NamedTuple):
         return "-".join(map(str, self))
 
     def box(self, bounds: Floats) -> Box:
-        """Its corners, within the bounds (2, 3) of all."""
+        """Corners (3,) of the cube, within the bounds (2, 3) of all."""
         side = (bounds[1] - bounds[0]) / 2**self.depth
         low = bounds[0] + side * self[1:]
         return low, low + side

@@ -194,7 +194,7 @@ def usable_records(records: Any) -> Floats:
 
 
 def usable_among(xyz: Floats, records: Any) -> Floats:
-    """The same, of the coordinates (n, 3) of all of them."""
+    """Coordinates (m, 3) of laspy's usable points, as :func:`usable_records` gives them, out of those (n, 3) of all."""
     noise = np.isin(np.asarray(records.classification), NOISE) | np.asarray(records.withheld, dtype=bool)
     if noise.any():
         xyz = xyz[~noise]

@@ -160,7 +160,7 @@ class Style(NamedTuple):
     attributes: dict[str, str]
 
     def qml(self) -> str:
-        """The same as a style of its own."""
+        """The definition as a style of its own, in QML."""
         return qml(self.body, self.attributes)
 
 
