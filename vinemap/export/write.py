@@ -87,18 +87,7 @@ def export_products(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"several products are called {', '.join(twice)}: export them one by one, each with its --out")
     tables = read_tables(products) if TABLE in formats else None
-    robot: dict[str, Any] = {"frame": frame, "grid": grid}
-    writers: dict[str, tuple[Callable[..., None], dict[str, Any]]] = {
-        "agopengps": (write_agopengps, {"lines": lines}),
-        "gazebo": (write_gazebo, {}),
-        "geojson": (write_geojson, {}),
-        "isoxml": (write_isoxml, {"lines": lines}),
-        "nav2": (write_nav2, robot),
-        "obj": (write_canopy, {"kind": "obj", "grid": grid}),
-        "opennav_coverage": (write_opennav_coverage, robot | {"vertices": vertices}),
-        "ply": (write_canopy, {"kind": "ply", "grid": grid}),
-        "shapefile": (write_shapefile, {}),
-    }
+    writers = _writers(lines=lines, frame=frame, grid=grid, vertices=vertices)
     for field in fields:
         for kind in of_parcels:
             write, options = writers[kind]
@@ -117,6 +106,24 @@ def export_products(
         yield f"{tables.told()} → {naming.shown(target)}"
     if empty:
         raise InputError("; ".join(empty))
+
+
+def _writers(
+    *, lines: str, frame: str, grid: bool, vertices: int | None
+) -> dict[str, tuple[Callable[..., None], dict[str, Any]]]:
+    """What writes a parcel in each format, and with which of the options."""
+    robot: dict[str, Any] = {"frame": frame, "grid": grid}
+    return {
+        "agopengps": (write_agopengps, {"lines": lines}),
+        "gazebo": (write_gazebo, {}),
+        "geojson": (write_geojson, {}),
+        "isoxml": (write_isoxml, {"lines": lines}),
+        "nav2": (write_nav2, robot),
+        "obj": (write_canopy, {"kind": "obj", "grid": grid}),
+        "opennav_coverage": (write_opennav_coverage, robot | {"vertices": vertices}),
+        "ply": (write_canopy, {"kind": "ply", "grid": grid}),
+        "shapefile": (write_shapefile, {}),
+    }
 
 
 def _write_whole(target: Path, write: Callable[[Path], None], record: dict[str, Any]) -> None:
