@@ -190,13 +190,12 @@ def _strongest_wave(windows: Values, taper: Values, band: tuple[float, float], d
     rows = rfft((windows - mean[:, None, None]) * taper, n=wide, axis=2)
     spectrum = fft(rows, n=wide, axis=1)
     power = spectrum.real**2 + spectrum.imag**2
-    how = COVER_RESOLUTION, *band, HARMONICS, 2 * PADDING
-    first = np.stack(_strongest(power, np.zeros((2, len(power))), *how))
+    first = np.stack(_strongest(power, np.zeros((2, len(power))), *band))
     second = np.zeros_like(first)
     second[1] = 1.0
     weak = np.flatnonzero((first[2] < SURE) | (drawn.off(_across(first)) > ASKEW))
     if len(weak):
-        second[:, weak] = _strongest(power[weak], np.ascontiguousarray(first[:2, weak]), *how)
+        second[:, weak] = _strongest(power[weak], np.ascontiguousarray(first[:2, weak]), *band)
     return np.concatenate([(_across(wave), 1 / np.hypot(*wave[:2]), wave[2]) for wave in (first, second)])
 
 
@@ -208,25 +207,15 @@ def _across(wave: Values) -> Values:
 
 
 @compiled
-def _strongest(
-    powers: Values,
-    other: Values,
-    cell: float,
-    shortest: float,
-    longest: float,
-    harmonics: int,
-    reach: int,
-) -> tuple[Values, Values, Values]:
+def _strongest(powers: Values, other: Values, shortest: float, longest: float) -> tuple[Values, Values, Values]:
     """Frequency of the strongest wave (y and x, cycles a metre) of powers (k, n, n/2 + 1), and its strength 0–1.
 
-    It lies 30° at the least from another (2, k), if that isn't zero.
-
-    The strength is the share of the power beyond long waves that the main lobes (``reach`` bins wide) about the
-    wave and its harmonics hold.
+    It is sought between two wavelengths in metres, 30° at the least from another wave (2, k), if that isn't zero. The
+    strength is the share of the power beyond long waves that the main lobes about the wave and its harmonics hold.
     """
     windows, n, _ = powers.shape
     half = n // 2
-    unit = n * cell
+    unit = n * COVER_RESOLUTION
     lowest, highest, long = (unit / longest) ** 2, (unit / shortest) ** 2, (unit / longest / 1.5) ** 2
     y, x, strength = np.empty(windows), np.empty(windows), np.empty(windows)
     for k in range(windows):
@@ -249,8 +238,8 @@ def _strongest(
             y[k], x[k], strength[k] = 0.0, 1 / longest, 0.0
             continue
         held = 0.0
-        for harmonic in range(1, harmonics + 1):
-            held += _lobe(power, harmonic * best_i, harmonic * best_j, reach)
+        for harmonic in range(1, HARMONICS + 1):
+            held += _lobe(power, harmonic * best_i, harmonic * best_j, 2 * PADDING)
         strength[k] = min(held / max(total, 1e-12), 1.0)
         here = np.log(power[best_i, best_j] + 1e-12)
         left = power[best_i, best_j - 1] if best_j else power[-best_i, 1]
