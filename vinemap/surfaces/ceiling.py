@@ -128,21 +128,11 @@ def _cover_crops(chm: Raster, high: float, density: float) -> Flags:
     """Cells (ny, nx) of long strips that are lower and broader than the rows on both sides of them.
 
     A row of young vines between old ones is lower, too, but no broader. Where most of what is lower is such strips, all
-    of it that is as broad is a cover crop, as at a block's edge. Where cells have so few points, on the mean, that one
-    shows a single stalk, and the next nothing, those about a cell tell what grows there.
+    of it that is as broad is a cover crop, as at a block's edge. ``density`` is the mean number of points in a cell.
     """
-    top = _in_cells(height_about(chm, high), chm.grid)
     out: Flags = np.zeros(chm.grid.shape, dtype=bool)
-    height = np.where(np.isnan(chm.values), maximum_filter(np.nan_to_num(chm.values), 3), chm.values)
-    vines = (top >= LOWEST) & (height >= GRASS) & (height <= high)
-    tall = vines & (height >= LOWER * top)
-    low = vines & ~tall
     across = 2 * round((np.sqrt(ENOUGH / density) - 1) / 2) + 1
-    if across > 1:
-        # As many as a row has that is one cell wide.
-        tall &= _share(tall, across) > 0.9 / across
-        low = ~tall & (_share(vines & ~tall, across) > 0.5 * _share(~tall, across))
-    low = binary_opening(low, CORNERS)
+    tall, low = _tall_and_low(chm, high, across)
     strips, width, length, depth = _parts(low)
     long = (length >= LONG * width) & (width >= BROADER)
     most = MOST * np.count_nonzero(low)
@@ -157,12 +147,12 @@ def _cover_crops(chm: Raster, high: float, density: float) -> Flags:
     a, b = nearest[:, i, j]
     half, wide = away[i, j], row_width[rows[a, b]]
 
-    def a_row_stands(across: Values) -> Flags:
-        """Whether a row stands so many cells across the row beside a strip."""
-        there = ((q + across * (q - p) / half).round().astype(int) for p, q in zip((i, j), (a, b), strict=True))
+    def a_row_stands(beyond: Values) -> Flags:
+        """Whether a row stands so many cells beyond the row beside a strip."""
+        there = ((q + beyond * (q - p) / half).round().astype(int) for p, q in zip((i, j), (a, b), strict=True))
         at = tuple(np.clip(k, 0, n - 1) for k, n in zip(there, low.shape, strict=True))
-        out: Flags = away[at] <= 0.5 * half
-        return out
+        beside: Flags = away[at] <= 0.5 * half
+        return beside
 
     strip = strips[i, j]
     n = np.maximum(np.bincount(strip, minlength=len(width)), 1)
@@ -175,6 +165,24 @@ def _cover_crops(chm: Raster, high: float, density: float) -> Flags:
         if across == 1:  # what was opened lacks its edges
             out = binary_dilation(out, CORNERS) & ~tall
     return out
+
+
+def _tall_and_low(chm: Raster, high: float, across: int) -> tuple[Flags, Flags]:
+    """Cells (ny, nx) with what is as high as rows thereabouts, and with what is lower, but no grass.
+
+    Where cells have so few points that one shows a single stalk, and the next nothing, those in squares of so many
+    cells ``across`` tell what grows in their middle.
+    """
+    top = _in_cells(height_about(chm, high), chm.grid)
+    height = np.where(np.isnan(chm.values), maximum_filter(np.nan_to_num(chm.values), 3), chm.values)
+    vines = (top >= LOWEST) & (height >= GRASS) & (height <= high)
+    tall = vines & (height >= LOWER * top)
+    low = vines & ~tall
+    if across > 1:
+        # As many as a row has that is one cell wide.
+        tall &= _share(tall, across) > 0.9 / across
+        low = ~tall & (_share(vines & ~tall, across) > 0.5 * _share(~tall, across))
+    return tall, binary_opening(low, CORNERS)
 
 
 def _share(mask: Flags, across: int) -> Values:
