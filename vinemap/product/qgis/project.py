@@ -28,6 +28,8 @@ MARGIN = 0.06
 """Share of the parcel's size that the map shows about it."""
 GEOMETRY = {"parcel": "Polygon", "unmapped": "Polygon", "row_ends": "Point", "key_points": "Point", "vines": "Point"}
 LEGEND = ("rows", "gaps", "unmapped", "parcel", "chm")
+EXPANDED = ("rows", "unmapped", "chm")
+"""Layers whose classes the tree shows."""
 
 
 class Entry(NamedTuple):
@@ -92,28 +94,21 @@ def project(
         Lines at the foot of the page to print.
     """
     crs = layers["parcel"].crs
-    drawn, groups = [], []
-    for group, entries in TREE.items():
-        members = []
-        for entry in entries:
-            if entry.name in layers:
-                source = f"{geopackage}|layername={entry.name}"
-                layer = _vector(entry, source, layers[entry.name])
-            else:
-                kind = "dtm" if entry.name == "relief" else entry.name
-                source = tif[kind]
-                style = relief_style() if entry.name == "relief" else raster_style(kind, rasters[kind].values)
-                layer = _map_layer(entry, source, style, crs, provider="gdal", type="raster")
-            drawn.append(layer)
-            members.append(_leaf(entry, source, expanded=entry.name in ("rows", "unmapped", "chm")))
-        shown = any(entry.shown for entry in entries)
-        state = "Qt::Checked" if shown else "Qt::Unchecked"
-        groups.append(node("layer-tree-group", *members, name=group, checked=state, expanded=int(shown)))
+    listed = {entry.name: entry for entries in TREE.values() for entry in entries}
+    drawn, sources = [], {}
+    for entry in listed.values():
+        if entry.name in layers:
+            sources[entry.name] = f"{geopackage}|layername={entry.name}"
+            drawn.append(_vector(entry, sources[entry.name], layers[entry.name]))
+        else:
+            kind = "dtm" if entry.name == "relief" else entry.name
+            sources[entry.name] = tif[kind]
+            style = relief_style() if entry.name == "relief" else raster_style(kind, rasters[kind].values)
+            drawn.append(_map_layer(entry, tif[kind], style, crs, provider="gdal", type="raster"))
     bounds = _extent(layers["parcel"])
     extent = node("extent", *(node(name, value) for name, value in bounds.items()))
     canvas = [node("units", "meters"), extent, node("rotation", "0"), node("destinationsrs", _srs(crs))]
     lines = {"head": _totals(layers["parcel"]), "foot": [crs.name, *notes]}
-    listed = {entry.name: entry for group in TREE.values() for entry in group}
     legend = [
         (_id(listed[name]), listed[name].title, "vector" if name in layers else "raster")
         for name in LEGEND
@@ -124,7 +119,7 @@ def project(
         node("homePath", path=""),
         node("title", title),
         node("projectCrs", _srs(crs)),
-        node("layer-tree-group", *groups),
+        node("layer-tree-group", *(_group(name, entries, sources) for name, entries in TREE.items())),
         node("mapcanvas", *canvas, name="theMapCanvas", annotationsVisible=1),
         node("projectlayers", *drawn),
         node("ProjectViewSettings", node("DefaultViewExtent", _srs(crs), **bounds)),
@@ -175,15 +170,26 @@ def _map_layer(entry: Entry, source: str, style: Style, crs: CRS, *, provider: s
     )
 
 
-def _leaf(entry: Entry, source: str, *, expanded: bool) -> Element:
+def _group(name: str, entries: Sequence[Entry], sources: Mapping[str, str]) -> Element:
+    """A group of the layer tree, shown if something in it is."""
+    shown = any(entry.shown for entry in entries)
+    leaves = [_leaf(entry, sources[entry.name]) for entry in entries]
+    return node("layer-tree-group", *leaves, name=name, checked=_checked(shown=shown), expanded=int(shown))
+
+
+def _leaf(entry: Entry, source: str) -> Element:
     return node(
         "layer-tree-layer",
         id=_id(entry),
         name=entry.title,
         source=source,
-        checked="Qt::Checked" if entry.shown else "Qt::Unchecked",
-        expanded=int(expanded),
+        checked=_checked(shown=entry.shown),
+        expanded=int(entry.name in EXPANDED),
     )
+
+
+def _checked(*, shown: bool) -> str:
+    return "Qt::Checked" if shown else "Qt::Unchecked"
 
 
 def _id(entry: Entry) -> str:
