@@ -116,55 +116,62 @@ def grow(
     vineyards: Sequence[Vineyard], dead: Sequence[NDArray[np.bool_]], terrain: Terrain, rng: np.random.Generator
 ) -> Stations:
     """The canopy of all rows, of which some vines are dead."""
-    parts = []
     plots = [(vineyard, row) for vineyard in vineyards for row in vineyard.rows]
-    lines = [
-        (k, vineyard, row, side, vines)
+    parts = [
+        _grow_row(k, vineyard, row, side, vines, terrain, rng)
         for k, ((vineyard, row), vines) in enumerate(zip(plots, dead, strict=True))
         for side in ((0.0,) if vineyard.curtains is None else (vineyard.curtains / 2, -vineyard.curtains / 2))
     ]
-    for k, vineyard, row, side, vines in lines:
-        length = way_along(row)[-1]
-        step = length / math.ceil(length / STATION)
-        arc = (np.arange(-BARE, round(length / step) + BARE) + 0.5) * step
-        n, ends = len(arc), np.diff(row[[0, 1, -2, -1]], axis=0)[::2]
-        beyond = ends / np.linalg.norm(ends, axis=1, keepdims=True) * BARE * step
-        xy = at(np.vstack([row[0] - beyond[0], row, row[-1] + beyond[1]]), arc + BARE * step)
-        along = np.gradient(xy, axis=0)
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        xy = xy + side * np.column_stack([-along[:, 1], along[:, 0]])
-
-        middles = vines_along(vineyard, length)
-        if vineyard.crown is None:
-            inside = _depth_in_hedge(arc, length, vines, rng)
-        else:
-            inside = _depth_in_heads(arc, middles, vines, vineyard.crown, rng)
-        vigour, girth, lean, foot = (np.interp(arc, middles, rng.normal(size=len(vines))) for _ in range(4))
-        fine = gaussian_filter1d(rng.normal(size=(2, n)), 1.0, axis=1)
-        smooth = waves(rng, 18.0)
-        shoots = (rng.random((2, n)) < [[0.04], [0.03]]) * rng.random((2, n))
-        bottom = vineyard.bottom + 0.04 * foot
-        top = vineyard.height * (1 + 0.03 * smooth(arc, arc) + 0.035 * vigour + 0.03 * fine[0]) + 0.4 * shoots[0]
-        round_over, lower = (0.25, 0.2) if vineyard.crown is None else (vineyard.crown / 2, 0.5)
-        top = np.maximum(top - lower * (top - bottom) * np.clip(1 - inside / round_over, 0, 1), bottom + 0.2)
-        half_width = vineyard.half_width * (1 + 0.08 * smooth(arc, -arc) + 0.1 * girth + 0.1 * fine[1])
-        to_full = 0.45 * vineyard.half_width if vineyard.crown is None else vineyard.crown / 2
-        share = np.clip(inside / to_full, 0, 1)
-        half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(share)
-        half_width[inside <= 0] = -1.0
-        thinning = np.linspace(0.5, 1.1, LAYERS)  # towards the shaded foot, of which little is ever matched
-        leaves = vineyard.leafiness * thinning * rng.gamma(1.5, 1 / 1.5, (n, LAYERS))
-        ground = terrain(*xy.T)
-        parts.append(
-            Stations(
-                np.full(n, k), xy, along, arc, np.full(n, step), ground, top, bottom, half_width, 0.02 * lean, leaves
-            )
-        )
     if not parts:
         none, flat = np.empty(0), np.empty((0, 2))
         no_leaves = np.empty((0, LAYERS))
         return Stations(np.empty(0, np.intp), flat, flat, none, none, none, none, none, none, none, no_leaves)
     return Stations(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _grow_row(
+    k: int,
+    vineyard: Vineyard,
+    row: Array,
+    side: float,
+    vines: NDArray[np.bool_],
+    terrain: Terrain,
+    rng: np.random.Generator,
+) -> Stations:
+    """The canopy of a row, number k of all, of which some vines are dead; or its curtain so many metres to the left."""
+    length = way_along(row)[-1]
+    step = length / math.ceil(length / STATION)
+    arc = (np.arange(-BARE, round(length / step) + BARE) + 0.5) * step
+    n, ends = len(arc), np.diff(row[[0, 1, -2, -1]], axis=0)[::2]
+    beyond = ends / np.linalg.norm(ends, axis=1, keepdims=True) * BARE * step
+    xy = at(np.vstack([row[0] - beyond[0], row, row[-1] + beyond[1]]), arc + BARE * step)
+    along = np.gradient(xy, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    xy = xy + side * np.column_stack([-along[:, 1], along[:, 0]])
+
+    middles = vines_along(vineyard, length)
+    if vineyard.crown is None:
+        inside = _depth_in_hedge(arc, length, vines, rng)
+    else:
+        inside = _depth_in_heads(arc, middles, vines, vineyard.crown, rng)
+    vigour, girth, lean, foot = (np.interp(arc, middles, rng.normal(size=len(vines))) for _ in range(4))
+    fine = gaussian_filter1d(rng.normal(size=(2, n)), 1.0, axis=1)
+    smooth = waves(rng, 18.0)
+    shoots = (rng.random((2, n)) < [[0.04], [0.03]]) * rng.random((2, n))
+    bottom = vineyard.bottom + 0.04 * foot
+    top = vineyard.height * (1 + 0.03 * smooth(arc, arc) + 0.035 * vigour + 0.03 * fine[0]) + 0.4 * shoots[0]
+    round_over, lower = (0.25, 0.2) if vineyard.crown is None else (vineyard.crown / 2, 0.5)
+    top = np.maximum(top - lower * (top - bottom) * np.clip(1 - inside / round_over, 0, 1), bottom + 0.2)
+    half_width = vineyard.half_width * (1 + 0.08 * smooth(arc, -arc) + 0.1 * girth + 0.1 * fine[1])
+    to_full = 0.45 * vineyard.half_width if vineyard.crown is None else vineyard.crown / 2
+    share = np.clip(inside / to_full, 0, 1)
+    half_width = (np.maximum(half_width, 0.08) + 0.15 * shoots[1]) * np.sqrt(share)
+    half_width[inside <= 0] = -1.0
+    thinning = np.linspace(0.5, 1.1, LAYERS)  # towards the shaded foot, of which little is ever matched
+    leaves = vineyard.leafiness * thinning * rng.gamma(1.5, 1 / 1.5, (n, LAYERS))
+    ground = terrain(*xy.T)
+    lean = 0.02 * lean
+    return Stations(np.full(n, k), xy, along, arc, np.full(n, step), ground, top, bottom, half_width, lean, leaves)
 
 
 def _depth_in_hedge(arc: Array, length: float, dead: NDArray[np.bool_], rng: np.random.Generator) -> Array:
