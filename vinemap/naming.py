@@ -7,11 +7,15 @@ import re
 import unicodedata
 from pathlib import Path, PurePath, PurePosixPath
 
+from vinemap.errors import InputError
+
 LONGEST_NAME = 64
 MOST_BYTES = 160
 """Bytes of a name, so that what is added to it for files stays below the 255 of most disks."""
-FORBIDDEN = re.compile(r'[/\\:*?"<>|!\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%(?=[0-9a-fA-F]{2})')
-"""What a name of a file can't have on one system or another; pyogrio cuts it at "!", QGIS takes %20 for a space."""
+FORBIDDEN = re.compile(r'[/\\:*?"<>|!;\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]|%(?=[0-9a-fA-F]{2})')
+"""What a name of a file can't have on one system or another; pyogrio cuts it, QGIS takes %20 for a space."""
+CUT = re.compile(r"!|;(?=[^/\\]*$)")
+"""Where pyogrio cuts a path: as that of an archive (its issue 632), or as an address with parameters."""
 DEVICES = re.compile(r"(con(in\$|out\$)?|prn|aux|nul|(com|lpt)[\d¹²³]) *(\..*)?", re.IGNORECASE)
 """Names that Windows keeps for itself."""
 
@@ -35,6 +39,19 @@ def composed(name: str) -> str:
 def plain(name: str) -> str:
     """A name without what makes trouble in names of files and on command lines."""
     return _cut(re.sub(r"^[. -]+|[. ]+$|[^\w .()+#&-]", "", name)) or "cloud"
+
+
+def uncut(path: Path) -> Path:
+    """A file's path, if pyogrio takes it as it is.
+
+    Raises
+    ------
+    InputError
+        If it would take a part of it for the whole.
+    """
+    if cut := CUT.search(str(path)):
+        raise InputError(f"{shown(path)}: has a {cut[0]!r} in its path, at which it would be cut: rename that")
+    return path
 
 
 def url_of(cloud: Path) -> str | None:

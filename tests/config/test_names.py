@@ -9,7 +9,7 @@ from vinemap.naming import safe
 
 
 @pytest.mark.parametrize(
-    "name", ["../F", "a/b", "a\\b", "", ".hidden", "a" * 80, "con:", "x\n", "end.", "Go!", "a%20b"]
+    "name", ["../F", "a/b", "a\\b", "", ".hidden", "a" * 80, "con:", "x\n", "end.", "Go!", "a;b", "a%20b"]
 )
 def test_names_with_characters_of_paths(name):
     with pytest.raises(ConfigError, match="can't name a file"):
@@ -32,6 +32,7 @@ def test_good_names(name):
         (".hidden", "hidden"),
         ("a%20b", "a-20b"),
         ("Go!", "Go-"),
+        ("12;13", "12-13"),
         ("x" * 80, "x" * 64),
     ],
 )

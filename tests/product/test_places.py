@@ -14,12 +14,16 @@ from systems import LINUX, POSIX
 
 from vinemap import paths
 from vinemap.config.names import check_name
-from vinemap.errors import OutputError
+from vinemap.errors import InputError, OutputError
+from vinemap.evaluate.reference import read_lines
+from vinemap.geo.boundaries import read_boundary
+from vinemap.geo.lines import read_rows
 from vinemap.naming import LONGEST_NAME, MOST_BYTES
 from vinemap.plugin.install import write_zip
 from vinemap.product import store
 from vinemap.product.geopackage import write_layer
 from vinemap.product.register.file import make_register
+from vinemap.product.seasons.products import read_record
 from vinemap.view.window import show
 
 
@@ -58,6 +62,30 @@ def test_a_folder_whose_path_would_be_cut(tmp_path):
     with pytest.raises(OutputError, match=r"Go!.*choose another folder"), store.workshop(folder):
         pass
     assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["Go!/a.gpkg", "a!b.gpkg", "a;b.gpkg"])
+def test_a_file_whose_path_would_be_cut(tmp_path, monkeypatch, name):
+    """Neither is something else read, or written, nor is a file that is there said to be missing."""
+    monkeypatch.chdir(tmp_path)
+    place = Path(name)
+    place.parent.mkdir(exist_ok=True)
+    for write in (lambda: write_layer(None, place, layer="rows"), lambda: make_register(place, CRS.from_epsg(32632))):
+        with pytest.raises(InputError, match=r"has a '[!;]' in its path, at which it would be cut: rename that"):
+            write()
+    place.touch()
+    for read in (read_boundary, read_rows, read_lines):
+        with pytest.raises(InputError, match=r"has a '[!;]' in its path, at which it would be cut: rename that"):
+            read(place)
+    assert names(place.parent) == [place.name]
+
+
+def test_a_product_whose_path_would_be_cut(tmp_path):
+    publish(tmp_path / "F")
+    (tmp_path / "F").rename(tmp_path / "F!")
+    (tmp_path / "F!" / "run.json").write_text('{"parcel": "F", "origin": {"lat": 44, "lon": 8, "alt": 300}}')
+    with pytest.raises(InputError, match="has a '!' in its path"):
+        read_record(tmp_path / "F!")
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")

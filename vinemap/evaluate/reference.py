@@ -11,6 +11,7 @@ import pyogrio
 from pyogrio.errors import DataLayerError, DataSourceError
 from shapely.errors import ShapelyError
 
+from vinemap import naming
 from vinemap.errors import InputError
 from vinemap.geo.layers import read_layer, words_of
 from vinemap.geo.lines import ROW_LAYER
@@ -40,7 +41,7 @@ def read_lines(path: str | Path, layer: str | None = None, *, parcel: str | None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks on a file's odd header
-            layer = _line_layer(path, layer)
+            layer = _line_layer(naming.uncut(path), layer)
             lines = read_layer(str(path), layer)
     except (DataSourceError, DataLayerError, ShapelyError, OSError) as error:
         reason = str(error).split("; ", maxsplit=1)[0].replace("\n", " ")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import shapely
 
+from vinemap import naming
 from vinemap.errors import InputError, reason_of
 from vinemap.geo.crs import LOCAL, WGS84, is_local
 
@@ -165,7 +166,7 @@ def _layers(path: Path, things: str) -> list[Layer]:
 def _inside(path: Path, things: str) -> str:
     """A file as GDAL finds it, or the one of layers in a ``.zip``."""
     if path.suffix.lower() != ".zip":
-        return str(path)
+        return str(naming.uncut(path))
     inner = layers_in(path)
     if len(inner) != 1:
         known = ", ".join(inner) or "none"

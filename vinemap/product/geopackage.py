@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import pyogrio
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
+from vinemap import naming
 from vinemap.errors import OutputError
 from vinemap.product.layers import LAYERS, Layer, conform
 from vinemap.product.qgis.style import layer_styles
@@ -127,7 +128,7 @@ def write_layer(frame: gpd.GeoDataFrame, path: Path, *, layer: str) -> None:
     OutputError
         If it can't be written, or something else is there.
     """
-    check_replaced(path, f"a GeoPackage of {layer}", known=[layer], needed=[layer])
+    check_replaced(naming.uncut(path), f"a GeoPackage of {layer}", known=[layer], needed=[layer])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with drafted(path, ".gpkg") as draft, _gdal(**WITHOUT_LOCKS):

@@ -16,7 +16,7 @@ import pyogrio
 import shapely
 from pyogrio.errors import DataLayerError, DataSourceError, FeatureError
 
-from vinemap import paths
+from vinemap import naming, paths
 from vinemap.compute.locks import held
 from vinemap.errors import BusyError, InputError, OutputError, reason_of
 from vinemap.geo.lines import ROW_LAYER
@@ -111,7 +111,7 @@ def make_register(path: Path, crs: CRS) -> None:
     OutputError
         If it can't be written.
     """
-    if path.exists():
+    if naming.uncut(path).exists():
         return
     tables = {name: _empty(layer, crs) for name, layer in REGISTER.items()}
     try:

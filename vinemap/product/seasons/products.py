@@ -110,7 +110,7 @@ def read_record(product: Path) -> tuple[Path, dict[str, Any]]:
             f"{naming.shown(product)}: no product of vinemap: give its folder, with {paths.RUN} in it, "
             "or its GeoPackage"
         ) from error
-    path = paths.geopackage(folder, record["parcel"])
+    path = naming.uncut(paths.geopackage(folder, record["parcel"]))
     if product not in (folder, path):
         raise InputError(f"{naming.shown(product)}: no product of vinemap: {naming.shown(path)} is one")
     return folder, record
