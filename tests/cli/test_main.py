@@ -80,6 +80,16 @@ def test_a_cloud_does_not_take_the_place_of_another_unseen(tmp_path):
     )
 
 
+def test_a_parcel_does_not_take_the_place_of_another(tmp_path):
+    """Whose folder would have the same name, or that was named for both."""
+    write_cloud(tmp_path / "a.las")
+    for other, options in (("1-2", ()), ("2", ("--out", "out"))):
+        first = vinemap("run", "a.las", "--parcel", "1/2", *options, cwd=tmp_path)
+        assert first.returncode == 0, first.stderr
+        second = vinemap("run", "a.las", "--parcel", other, *options, cwd=tmp_path)
+        assert_refused(second, "holds the product of parcel 1/2: give another folder with --out")
+
+
 def test_settings_and_names_from_the_command_line(tmp_path, survey):
     (tmp_path / "s.yaml").write_text("sections: {step: 1.0}\ncurves: {min_length: 100}\n")
     out = tmp_path / "x" / "y"

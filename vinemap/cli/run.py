@@ -57,6 +57,7 @@ def run(
     from vinemap.config.surveys import load_settings
     from vinemap.errors import OutputError
     from vinemap.geo.crs import parse_crs
+    from vinemap.product.json_values import read_object
     from vinemap.product.recipe import made_of
     from vinemap.warm import warming
 
@@ -64,9 +65,10 @@ def run(
     survey = paths.named_by(files)
     name = check_parcel(parcel) if parcel is not None else survey
     folder = out or paths.product_folder(survey, name)
-    earlier = made_of(folder)
-    if out is None and earlier and not any(file.name in earlier for file in files):
-        raise OutputError(f"{folder}: holds the product of {', '.join(earlier)}: give another folder with --out")
+    earlier, known = made_of(folder), read_object(paths.run_record(folder)).get("parcel")
+    if earlier and (known != name or (out is None and not any(file.name in earlier for file in files))):
+        whose = ", ".join(earlier) if known == name else f"parcel {known}"
+        raise OutputError(f"{folder}: holds the product of {whose}: give another folder with --out")
     chosen = load_settings(settings) if settings else Settings()
     extra = {key: True for key, wanted in {"classified": classified, "plain": plain}.items() if wanted}
     options = {
