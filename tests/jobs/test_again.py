@@ -13,7 +13,7 @@ from vinemap import paths
 from vinemap.cloud.las import read_cloud
 from vinemap.errors import OutputError
 from vinemap.jobs import survey
-from vinemap.jobs.plan import CURRENT, DONE, FAILED
+from vinemap.jobs.plan import CURRENT, DONE, FAILED, check_same
 from vinemap.product import recipe
 from vinemap.product.seasons.products import GONE, places_of
 
@@ -104,6 +104,21 @@ def test_a_new_version_does_all_again(done, monkeypatch):
 def test_a_cloud_that_moved_is_the_same(done):
     done.cloud = done.cloud.rename(done.cloud.with_name("june.las"))
     assert done.planned() == []
+
+
+def test_a_cloud_does_not_take_the_place_of_another(done, tmp_path):
+    """Of the same name, in another folder; one that has changed, or was moved, is the same."""
+    other, moved = tmp_path / "other.las", tmp_path / "june" / "may.las"
+    moved.parent.mkdir()
+    shutil.copy(done.cloud, moved)
+    for cloud in (done.cloud, moved):
+        check_same(done.folder, [other, cloud])
+    os.truncate(moved, 999)
+    with pytest.raises(OutputError, match=f"holds the products of {done.cloud}: give another folder with --out"):
+        check_same(done.folder, [other, moved])
+    os.truncate(done.cloud, 999)
+    check_same(done.folder, [done.cloud])
+    check_same(tmp_path / "new", [moved])
 
 
 def test_a_parcel_for_which_a_grid_was_lacking_is_tried_again(job):

@@ -219,6 +219,11 @@ def test_the_command(cloud, boundaries, tmp_path):
     assert [line.split(": ")[0] for line in lines] == ["A", "B", "C"]
     assert lines[0].startswith("A: 4 rows, ")
     assert sorted(path.name for path in folder.iterdir()) == ["A", "B", "C", *SURVEYS]
+    other = tmp_path / "other" / cloud.name
+    other.parent.mkdir()
+    other.write_bytes(cloud.read_bytes() + b"more")
+    done = vinemap("survey", other, "--boundaries", boundaries, cwd=tmp_path)
+    assert_refused(done, f"holds the products of {cloud}: give another folder with --out")
     words = "--boundaries", boundaries, "--parcel", "B", "--parcel", "empty", "--out", "out"
     done = vinemap("survey", cloud, *words, cwd=tmp_path)
     assert done.returncode == 1

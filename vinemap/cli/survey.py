@@ -64,10 +64,11 @@ def survey(
     from vinemap import paths
     from vinemap.cloud.files import cloud_files
     from vinemap.config.surveys import load_settings, survey_config
-    from vinemap.jobs.plan import FAILED
+    from vinemap.jobs.plan import FAILED, check_same
     from vinemap.jobs.survey import map_survey
 
-    name = paths.named_by(cloud_files(clouds))
+    files = cloud_files(clouds)
+    name = paths.named_by(files)
     config = survey_config(
         survey=name,
         cloud=list(clouds),
@@ -82,6 +83,8 @@ def survey(
         settings=load_settings(settings) if settings else None,
         job={key: value for key, value in job.items() if value is not None},
     )
+    if out is None:
+        check_same(paths.survey_products(name), files)
     failed = False
     for outcome in map_survey(config, out or paths.survey_products(name), again=again):
         failed |= outcome.state == FAILED

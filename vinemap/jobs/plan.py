@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vinemap import __version__, paths
 from vinemap.config.names import check_parcel
-from vinemap.errors import ConfigError, InputError
+from vinemap.errors import ConfigError, InputError, OutputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
 from vinemap.geo.layers import read_points, some_of
@@ -18,11 +18,11 @@ from vinemap.geo.lines import KnownRows, read_rows, rows_of
 from vinemap.jobs.register import Known, candidates_due, known_of
 from vinemap.product.recipe import VINES, Recipe, Source, fit_for, flown, product_in, read_clouds, read_source, vines_of
 from vinemap.product.record import in_words
-from vinemap.product.seasons.products import GONE, whose
+from vinemap.product.seasons.products import GONE, places_of, whose
 from vinemap.product.store import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     import geopandas as gpd
 
@@ -178,6 +178,32 @@ def _settled(recipe: Recipe, folder: Path, hopeless: Outcome | None) -> Outcome 
         numbers = product.rows, product.length, 0.0
         return Outcome(recipe.parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key)
     return hopeless if hopeless and hopeless.key == key else None
+
+
+def check_same(folder: Path, clouds: Sequence[Path]) -> None:
+    """Make sure that a folder of products is no other survey's, as clouds' names alone don't tell them apart.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of products' folders.
+    clouds : sequence of Path
+        Files that are to be mapped there: one must lie where one of the earlier lay, or have its name and size.
+
+    Raises
+    ------
+    OutputError
+        If it holds products of others.
+    """
+    earlier = _earlier(folder).sources if places_of(folder) else []
+    places = {one.path.absolute() for one in earlier}
+    files = {(one.path.name, *one.stamp[:1]) for one in earlier}
+    same = [
+        cloud.absolute() in places or (cloud.is_file() and (cloud.name, cloud.stat().st_size) in files)
+        for cloud in clouds
+    ]
+    if earlier and not any(same):
+        raise OutputError(f"{folder}: holds the products of {earlier[0].path}: give another folder with --out")
 
 
 def elsewhere(config: SurveyConfig, outcomes: Iterable[Outcome]) -> list[Outcome]:
