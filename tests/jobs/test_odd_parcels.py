@@ -1,6 +1,7 @@
 """Parcels outside the cloud, with odd names or polygons, or whose place is taken: they cost no other."""
 
 import json
+import shutil
 
 import doubles
 import geopandas as gpd
@@ -28,6 +29,19 @@ def test_parcels_that_are_not_in_the_cloud(job):
     assert job.states() == {"A": CURRENT, "B": CURRENT, "away": OUTSIDE}
     assert job.worked == []
     assert not (job.folder / "away").exists()
+
+
+def test_a_parcel_that_is_no_longer_in_the_cloud(job):
+    """Its product stays, which is said, and as long as it is there."""
+    job.draw(A=0, B=1, C=2)
+    job.run()
+    job.draw(A=0, B=50, C=60)
+    for _ in range(2):
+        outcomes = job.run()
+        assert outcomes["B"].line() == "B: not in the cloud: its earlier product stays, of another cloud or polygon"
+        assert (job.folder / "B" / "points.txt").is_file()
+    shutil.rmtree(job.folder / "B")
+    assert job.run()["B"].line() == "B: not in the cloud"
 
 
 def test_one_parcel_that_is_not_in_the_cloud(job, monkeypatch):

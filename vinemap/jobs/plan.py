@@ -152,7 +152,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
             known=rows.get(parcel),
             vines=vines.get(parcel),
         )
-        settled = None if again else _settled(recipe, paths.parcel_folder(folder, parcel), hopeless.get(parcel))
+        settled = None if again else _settled(recipe, folder, hopeless.get(parcel))
         if settled:
             plan.settled.append(settled)
         else:
@@ -173,11 +173,21 @@ def _unusable(polygons: Mapping[str, Parcel | InputError | None], *, listed: boo
 
 def _settled(recipe: Recipe, folder: Path, hopeless: Outcome | None) -> Outcome | None:
     """What becomes of a parcel that needs no work: its product is up to date, or it would fail as it did before."""
-    key, product = recipe.key, product_in(folder)
+    key, product = recipe.key, product_in(paths.parcel_folder(folder, recipe.parcel))
     if product and (product.key, product.parcel) == (key, recipe.parcel):
         numbers = product.rows, product.length, 0.0
         return Outcome(recipe.parcel, CURRENT, *numbers, reason="; ".join(product.warnings), key=key)
-    return hopeless if hopeless and hopeless.key == key else None
+    if not (hopeless and hopeless.key == key):
+        return None
+    return outside(recipe, folder) if hopeless.state == OUTSIDE else hopeless
+
+
+def outside(recipe: Recipe, folder: Path) -> Outcome:
+    """What is to be known of a parcel without a point in the cloud, and of the product that it may have in a folder."""
+    there = product_in(paths.parcel_folder(folder, recipe.parcel))
+    stays = "its earlier product stays, of another cloud or polygon"
+    reason = stays if there and there.parcel == recipe.parcel else ""
+    return Outcome(recipe.parcel, OUTSIDE, reason=reason, key=recipe.key)
 
 
 def check_same(folder: Path, clouds: Sequence[Path]) -> None:

@@ -18,7 +18,7 @@ from vinemap.cloud.pdal.engine import check_engines
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
-from vinemap.jobs.plan import DONE, FAILED, LEFT, OUTSIDE, Outcome, Plan, elsewhere, plan_survey, write_record
+from vinemap.jobs.plan import DONE, FAILED, LEFT, Outcome, Plan, elsewhere, outside, plan_survey, write_record
 from vinemap.jobs.register import is_due, note
 from vinemap.jobs.workers import Worker, Workers
 from vinemap.parcel import follow
@@ -172,7 +172,7 @@ def _work(
 ) -> Iterator[Outcome]:
     with _engine(plan, config) as workers, ThreadPoolExecutor(workers.slots) as threads:
         try:
-            jobs = _jobs(plan, config, aside)
+            jobs = _jobs(plan, config, folder, aside)
             # Two for each slot, so that it need not wait until this is asked for the next outcome.
             waiting: set[Future[Outcome]] = set()
             while True:
@@ -193,7 +193,9 @@ def _work(
             raise
 
 
-def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recipe, Piece | Outcome | None]]:
+def _jobs(
+    plan: Plan, config: SurveyConfig, folder: Path, aside: Path
+) -> Iterator[tuple[Recipe, Piece | Outcome | None]]:
     """Recipes with their points, the largest first; with none where a parcel reads them itself, of a COPC's, say."""
     dealt: dict[str, list[Recipe]] = {}
     for recipe in plan.recipes:
@@ -203,13 +205,13 @@ def _jobs(plan: Plan, config: SurveyConfig, aside: Path) -> Iterator[tuple[Recip
     named = {recipe.parcel for recipes in together for recipe in recipes}
     yield from ((recipe, None) for recipe in plan.recipes if recipe.parcel not in named)
     for number, recipes in enumerate(together):
-        folder = aside / str(number)
-        folder.mkdir()
-        yield from _dealt(recipes, plan, config, folder)
+        place = aside / str(number)
+        place.mkdir()
+        yield from _dealt(recipes, plan, config, folder, place)
 
 
 def _dealt(
-    recipes: list[Recipe], plan: Plan, config: SurveyConfig, aside: Path
+    recipes: list[Recipe], plan: Plan, config: SurveyConfig, folder: Path, aside: Path
 ) -> Iterator[tuple[Recipe, Piece | Outcome]]:
     """Recipes of one engine, which reads their cloud once, with their points."""
     clouds, limit = recipes[0].clouds, config.job.limit * len(recipes)
@@ -228,7 +230,7 @@ def _dealt(
         if isinstance(piece, InputError):
             yield recipe, Outcome(recipe.parcel, FAILED, reason=str(piece), key=recipe.key, heals=piece.heals)
         elif sizes[k] == 0 and not plan.listed:
-            yield recipe, Outcome(recipe.parcel, OUTSIDE, key=recipe.key)
+            yield recipe, outside(recipe, folder)
         else:
             yield recipe, piece
 
@@ -260,7 +262,7 @@ def _run(
     try:
         summary: Summary = step(recipe.parcel, workers.run, follow, recipe, target, **options)
     except OutsideError as error:
-        return failed(reason=str(error)) if plan.listed else Outcome(recipe.parcel, OUTSIDE, key=key)
+        return failed(reason=str(error)) if plan.listed else outside(recipe, folder)
     except VinemapError as error:
         heals = error.heals or not isinstance(error, (InputError, ConfigError))
         return failed(seconds=time.perf_counter() - began, reason=str(error), heals=heals)
