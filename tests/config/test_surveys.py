@@ -181,6 +181,24 @@ def test_parcels_inherit_what_they_leave_open(write):
     assert (b.origin.lat, b.settings.polygon.c, b.settings.fit.smoothing) == (45, 11, 5)
 
 
+def test_null_is_said_and_an_empty_section_says_nothing(write, tmp_path):
+    common = "origin: [44, 7, 100]\nsettings: {missing: {vine_spacing: 0.9}, fit: }\njob:\n"
+    estate = load_estate(
+        write(f"{common}rows: all.gpkg\noverrides:\n  A: {{settings: {{missing: {{vine_spacing: null}}}}}}\n")
+    )
+    assert estate.settings.fit == Settings().fit
+    assert estate.of_parcel("A").settings.missing.vine_spacing is None
+    own = tmp_path / "own.yaml"
+    own.write_text("rows: null\ncloud: null\norigin: null\nsettings: {missing: {vine_spacing: null}}\noverrides:\n")
+    config = estate.of_survey("may", own, cloud=Path("a.laz"), boundaries=None)
+    assert (config.cloud, config.rows, config.origin) == (Path("a.laz"), Path("all.gpkg"), None)
+    assert config.settings.missing.vine_spacing is None
+    own.write_text("settings:\njob:\n")
+    assert estate.of_survey("may", own).settings.missing.vine_spacing == 0.9
+    own.write_text("settings:\n  # fit: {smoothing: 5}\n")
+    assert load_settings(own) == Settings()
+
+
 def test_surveys_inherit_what_they_leave_open(write, tmp_path):
     """Estate, survey, parcel: the nearest counts, key by key."""
     estate = load_estate(

@@ -146,12 +146,17 @@ class EstateConfig(_Surveys):
         if parcels and isinstance(parcels, list) and isinstance(overrides, dict):
             names = {naming.composed(str(parcel)) for parcel in parcels}
             common["overrides"] = {key: own for key, own in overrides.items() if naming.composed(str(key)) in names}
-        return validated(SurveyConfig, merge(merge(common, files), stated) | {"survey": name}, own)
+        found = {key: file for key, file in files.items() if file}
+        return validated(SurveyConfig, merge(common | found, stated) | {"survey": name}, own)
 
 
 def _place(stated: dict[str, Any], folder: Path) -> None:
-    """Let files that a survey's own file names be named from its folder on; addresses stay as they are."""
-    stated |= {key: _beside(folder, stated[key]) for key in FILES if stated.get(key)}
+    """Let files that a survey's own file names be named from its folder on; addresses stay, and null names none."""
+    for key in [key for key in FILES if key in stated]:
+        if stated[key] is None:
+            del stated[key]
+        elif stated[key]:
+            stated[key] = _beside(folder, stated[key])
     overrides = stated.get("overrides")
     for part in (stated, *(overrides.values() if isinstance(overrides, dict) else ())):
         match part:
@@ -206,4 +211,6 @@ def load_settings(path: Path) -> Settings:
         That names the key, its value and what it may be.
     """
     data = read_yaml(path)
-    return validated(Settings, data["settings"] if isinstance(data, dict) and set(data) == {"settings"} else data, path)
+    if isinstance(data, dict) and set(data) == {"settings"}:
+        data = merge({}, data["settings"])
+    return validated(Settings, data, path)

@@ -38,8 +38,10 @@ def checked_by(check: Callable[[T], Any]) -> AfterValidator:
 
 
 def merge(common: Any, own: Any) -> Any:
-    """Options with others laid over them, key by key."""
-    if isinstance(common, dict) and isinstance(own, dict) and common is not own:
+    """Options with others laid over them, key by key; null is one, but where it stands for a section."""
+    if not isinstance(common, dict) or common is own:
+        return own
+    if isinstance(own, dict):
         return common | {key: merge(common.get(key), value) for key, value in own.items()}
     return common if own is None else own
 
