@@ -1,12 +1,15 @@
 """The register in a night's work: its rows are known, others are candidates, and what is wrong costs a line."""
 
+import json
 import shutil
 import sqlite3
 
 import geopandas as gpd
+import numpy as np
 import pyogrio
 import pytest
-from products import map_here
+import shapely
+from products import map_here, place_product
 
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError
@@ -104,3 +107,36 @@ def test_a_register_that_cannot_be_read_leaves_products_as_they_are(survey):
     with pytest.raises(InputError, match=r"register\.gpkg: no such file: vinemap register makes it of products"):
         list(map_survey(config, folder))
     assert gpd.read_file(folder / "A" / "A.gpkg", layer="rows").equals(before)
+
+
+LINES = np.array([shapely.LineString([(428000, 4940000 + 3 * k), (428030, 4940001 + 3 * k)]) for k in range(5)])
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A register of a parcel F of five rows."""
+    product = place_product(tmp_path / "june", "F", LINES, survey="june", flown="2026-06-10")
+    list(register_products([product], tmp_path / "register.gpkg"))
+    return tmp_path / "register.gpkg"
+
+
+@pytest.mark.parametrize("how", [None, "add", "replace"])
+def test_a_parcel_of_the_same_name_elsewhere_keeps_its_rows(path, tmp_path, how):
+    """As where each of an estate's hills has a parcel 1."""
+    away = shapely.transform(LINES[:3], lambda xy: xy + [800, 0])
+    product = place_product(tmp_path / "july", "F", away, survey="july", flown="2026-07-10")
+    assert list(register_products([product], path, how=how)) == [f"F: rows registered: 3 → {path}"]
+    rows = read_register(path).rows
+    assert rows["label"].tolist() == [f"{k} F" for k in range(1, 9)]
+    assert rows["grubbed"].isna().all()
+
+
+def test_rows_within_the_polygon_of_a_parcel_are_its_own(path, tmp_path):
+    """Though nothing is found beside them any more."""
+    product = place_product(tmp_path / "july", "F", LINES[:1], survey="july", flown="2026-07-10")
+    record = json.loads((product / "run.json").read_text())
+    (product / "run.json").write_text(json.dumps(record | {"bounded": True}))
+    polygon = gpd.GeoDataFrame(geometry=[shapely.box(427990, 4939990, 428040, 4940008)], crs=32632)
+    pyogrio.write_dataframe(polygon, product / "F.gpkg", layer="parcel", driver="GPKG", append=True)
+    (told,) = register_products([product], path, how="replace")
+    assert told == f"F: rows registered: 0, there before: 1, there no more: 3 → {path}"

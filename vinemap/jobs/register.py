@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,7 +22,7 @@ from vinemap.geo.lines import KnownRows, rows_of
 from vinemap.product.register.edits import Settled, are_lines, number, settle
 from vinemap.product.register.file import make_register, read_register, stamps_of, update_register
 from vinemap.product.register.tables import Update
-from vinemap.product.seasons.products import read_record, read_rows
+from vinemap.product.seasons.products import outline_in, read_record, read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -198,6 +199,8 @@ class _Product(NamedTuple):
     survey: str
     flown: str
     rows: gpd.GeoDataFrame
+    reach: shapely.Geometry
+    """Where rows of its name are its own, and not those of another parcel of that name."""
 
 
 def register_products(products: Iterable[Path], path: Path, *, how: str | None = None) -> Iterator[str]:
@@ -249,7 +252,17 @@ def _product(product: Path) -> _Product:
         raise InputError(f"{naming.shown(product)}: its rows can't be read: map the parcel again")
     if is_local(rows.crs):
         raise InputError(f"{parcel}: its coordinates are local, and a register has rows on the globe: give it a CRS")
-    return _Product(parcel, str(record.get("survey") or parcel), str(record["flown"])[:10], rows)
+    reach = _reach(folder, parcel, rows, bounded=bool(record.get("bounded")))
+    return _Product(parcel, str(record.get("survey") or parcel), str(record["flown"])[:10], rows, reach)
+
+
+def _reach(folder: Path, parcel: str, rows: gpd.GeoDataFrame, *, bounded: bool) -> shapely.Geometry:
+    """Where rows of a parcel may stand: in its polygon, or else as far from those that were found as they reach."""
+    found = shapely.union_all(rows.geometry.to_numpy()).convex_hull
+    if bounded:
+        with suppress(ValueError):
+            return shapely.buffer(found.union(outline_in(folder, parcel)), SPACING)
+    return shapely.buffer(found, max(SPACING, 2 * shapely.minimum_bounding_radius(found)))
 
 
 def _put(one: _Product, settled: Settled, register: Register, how: str | None) -> tuple[Settled, str]:
@@ -260,7 +273,7 @@ def _put(one: _Product, settled: Settled, register: Register, how: str | None) -
     around = shapely.buffer(shapely.union_all(one.rows.geometry.to_numpy()).convex_hull, SPACING)
     placed = project(rows["line"].where(are_lines(rows), None).to_numpy(), register.crs, one.rows.crs)
     beside = shapely.intersects(placed, around) & (rows["parcel"].fillna(one.parcel) == one.parcel).to_numpy()
-    beside |= (rows["parcel"] == one.parcel).to_numpy() & are_lines(rows)
+    beside |= (rows["parcel"] == one.parcel).to_numpy() & shapely.intersects(placed, one.reach)
     standing = beside & ~(rows["grubbed"].fillna("9") <= one.flown).to_numpy()
     there, new = _matched(one.rows, placed[standing], anew=how == "replace")
     gone = rows.index[standing][~there]

@@ -129,7 +129,7 @@ def read_product(place: Path) -> Product | None:
         parcel = str(record["parcel"])
         item = read_object(paths.stac_item(place, parcel))
         local = item["geometry"] is None
-        outline = _local_outline(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
+        outline = outline_in(place, parcel) if local else shapely.from_geojson(json.dumps(item["geometry"]))
         linked = {
             "report": paths.report(place, parcel),
             "layers": paths.geopackage(place, parcel),
@@ -174,8 +174,8 @@ def shift_between(later: Product, earlier: Product) -> tuple[float, float] | Non
     return later.off[1] - earlier.off[1], later.off[2] - earlier.off[2]
 
 
-def _local_outline(folder: Path, parcel: str) -> shapely.Geometry:
-    """A parcel's polygon where nothing tells of its place on the globe."""
+def outline_in(folder: Path, parcel: str) -> shapely.Geometry:
+    """The polygon of a product's parcel, in its own CRS; ValueError if it can't be read."""
     try:
         outline: shapely.Geometry = pyogrio.read_dataframe(paths.geopackage(folder, parcel), layer="parcel").union_all()
     except (DataSourceError, DataLayerError) as error:
