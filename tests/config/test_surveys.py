@@ -223,6 +223,8 @@ def test_surveys_inherit_what_they_leave_open(write, tmp_path):
     assert list(config.overrides) == ["é", "North 3"]
     assert estate.of_survey("may", None, cloud=Path("a.laz")).cloud == Path("a.laz")
     assert list(estate.of_survey("may", None).overrides) == ["A", "é", "North 3"]
+    own.write_text("overrides: {A: {}, B: {}}\n")
+    assert estate.of_survey("may", own).own_overrides() == {"B"}
 
 
 def test_a_parcel_that_states_nothing_is_no_other_for_it(write):

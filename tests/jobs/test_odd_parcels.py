@@ -44,6 +44,13 @@ def test_a_parcel_that_is_no_longer_in_the_cloud(job):
     assert job.run()["B"].line() == "B: not in the cloud"
 
 
+def test_what_is_otherwise_in_a_parcel_that_is_not_there(job):
+    job.draw(**{"A": 0, "North 3": 1})
+    found = job.run(overrides={"A": {}, "North  3": {}, "north 3": {}, "B": {}})
+    assert found["overrides"].line() == "overrides: left out: no parcel is called B, north 3"
+    assert "overrides" not in job.run(overrides={"A": {}, "B": {}}, parcels=["A", "B"])
+
+
 def test_one_parcel_that_is_not_in_the_cloud(job, monkeypatch):
     """All others being up to date."""
     monkeypatch.setattr(survey, "follow", needs_points)

@@ -108,12 +108,17 @@ class SurveyConfig(_Surveys):
         "data/surveys/<survey>/<survey>.laz by default",
     )
     simulate: Literal["barolo"] | None = Field(None, description="example to simulate where the cloud is missing")
+    _shared: set[str] = PrivateAttr(default_factory=set)
 
     @model_validator(mode="after")
     def _example(self) -> SurveyConfig:
         if self.simulate and (self.simulate != self.survey or self.cloud):
             raise ValueError(f"simulate ({self.simulate}) must be the survey's own name, and cloud be left out")
         return self
+
+    def own_overrides(self) -> set[str]:
+        """Names for which the survey itself says what is otherwise, not the estate for whichever survey has them."""
+        return self.overrides.keys() - self._shared
 
 
 class EstateConfig(_Surveys):
@@ -147,7 +152,9 @@ class EstateConfig(_Surveys):
             names = {naming.composed(str(parcel)) for parcel in parcels}
             common["overrides"] = {key: own for key, own in overrides.items() if naming.composed(str(key)) in names}
         found = {key: file for key, file in files.items() if file}
-        return validated(SurveyConfig, merge(common | found, stated) | {"survey": name}, own)
+        config = validated(SurveyConfig, merge(common | found, stated) | {"survey": name}, own)
+        config._shared.update(self.overrides.keys())  # noqa: SLF001
+        return config
 
 
 def _place(stated: dict[str, Any], folder: Path) -> None:

@@ -158,6 +158,8 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
         else:
             plan.recipes.append(recipe)
     if not listed:
+        if strange := sorted(config.own_overrides() - polygons.keys()):
+            plan.settled.append(Outcome("overrides", LEFT, reason=f"no parcel is called {some_of(strange)}"))
         plan.settled.extend(_gone(folder, config.survey, polygons, caseless=caseless))
     return plan
 
