@@ -103,6 +103,8 @@ def test_a_name_that_several_polygons_have_is_told(tmp_path):
     assert remark == "it is called after column 'id', as 'North' stands more than once in 'name'"
     (remark,) = read_parcel(path, parcel="North").remarks
     assert remark == "2 polygons of b.gpkg are called 'North', and count as one parcel"
+    (remark,) = read_parcel(path).remarks
+    assert remark == "all 3 polygons of b.gpkg count as one parcel"
 
 
 def test_a_parcels_name_in_another_column_is_another_thing(tmp_path):

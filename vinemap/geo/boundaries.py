@@ -103,11 +103,12 @@ def read_parcel(path: Path, *, parcel: str | None = None, lone: bool = False, lo
             raise found
         return found
     made = _parcel(table, np.arange(len(table.frame)), path)
-    others = [_described(table, row) for row in np.flatnonzero(~table.area).tolist()]
-    if others:
-        left = f"{path.name} holds what is no polygon, and is left out: {some_of(others)}"
-        return made._replace(remarks=(*made.remarks, left))
-    return made
+    n, others = np.count_nonzero(table.area), [_described(table, row) for row in np.flatnonzero(~table.area).tolist()]
+    told = {
+        f"{path.name} holds what is no polygon, and is left out: {some_of(others)}": bool(others),
+        f"all {n} polygons of {path.name} count as one parcel": n > 1,
+    }
+    return made._replace(remarks=(*made.remarks, *(remark for remark, holds in told.items() if holds)))
 
 
 def read_parcels(
