@@ -101,6 +101,19 @@ def test_the_same_again_and_what_others_put_there_stays(tmp_path, product, expor
     assert not list(tmp_path.rglob(".*"))
 
 
+def test_that_of_another_survey_is_not_replaced_unseen(tmp_path, product):
+    """As where parcels of two have one name."""
+    record = json.loads((product / "run.json").read_text(encoding="utf-8"))
+    for survey in ("may", "june"):
+        shutil.copytree(product, tmp_path / survey)
+        (tmp_path / survey / "run.json").write_text(json.dumps(record | {"survey": survey}), encoding="utf-8")
+    out = tmp_path / "out"
+    lines = [*export_products([tmp_path / "may"], out, formats=["geojson"])]
+    lines += export_products([tmp_path / "june"], out, formats=["geojson", "nav2"])
+    lines += export_products([tmp_path / "june"], out, formats=["nav2"])
+    assert [line.partition("; ")[2] for line in lines] == ["", "it replaces that of the survey may", ""]
+
+
 def test_the_command(tmp_path, product):
     done = vinemap("export", product, "--format", "isoxml", "--format", "geojson", "--outer", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

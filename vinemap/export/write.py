@@ -21,7 +21,7 @@ from vinemap.export.opennav_coverage import write_opennav_coverage
 from vinemap.export.table import read_tables, write_tables
 from vinemap.export.vector import write_geojson, write_shapefile
 from vinemap.product import store
-from vinemap.product.seasons.products import products_of
+from vinemap.product.seasons.products import products_of, whose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -89,16 +89,17 @@ def export_products(
     tables = read_tables(products) if TABLE in formats else None
     writers = _writers(lines=lines, frame=frame, grid=grid, vertices=vertices)
     for field in fields:
-        for kind in of_parcels:
+        targets = [paths.export_folder(out, field.parcel, kind) for kind in of_parcels]
+        others = {known[1] for target in targets if (known := whose(target))} - {field.survey}
+        for kind, target in zip(of_parcels, targets, strict=True):
             write, options = writers[kind]
-            target = paths.export_folder(out, field.parcel, kind)
             _write_whole(
                 target, partial(write, field, **options), _record(field, kind, {"lines": lines} | drawn | options)
             )
         lanes = f", {len(field.lanes)} lanes" if wanted != "rows" else ""
-        yield (
-            f"{field.parcel}: {len(field.rows)} rows{lanes} → {naming.shown(target.parent)} ({', '.join(of_parcels)})"
-        )
+        place = naming.shown(paths.parcel_folder(out, field.parcel))
+        told = f"; it replaces that of the survey {', '.join(sorted(others))}" if others else ""
+        yield f"{field.parcel}: {len(field.rows)} rows{lanes} → {place} ({', '.join(of_parcels)}){told}"
     if tables:
         target = paths.table_folder(out)
         record = {"vinemap": __version__, "format": TABLE, "products": tables.products}
