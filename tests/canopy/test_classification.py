@@ -1,5 +1,7 @@
 """Classes and rows of a cloud's points."""
 
+from dataclasses import replace
+
 import laspy
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from vinemap.chain import map_rows
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.write import write_classified
 from vinemap.config.settings import Settings
+from vinemap.geo.crs import horizontal, parse_crs, vertical_name
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +72,19 @@ def test_file_read_back(classified, tmp_path):
     assert (np.asarray(back["row_id"]) == row_id).all()
     assert np.abs(np.asarray(back["HeightAboveGround"]) - found.cloud.heights).max() < 1e-4
     assert back.header.parse_crs().to_epsg() == 32632
+
+
+@pytest.mark.parametrize(
+    "vertical", [None, "EGM96 height", "ellipsoidal height", "the harbour's", "Poolbeg height (ft(Br36))"]
+)
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:3003", "local"])
+def test_the_datum_of_heights_is_kept(classified, tmp_path, crs, vertical):
+    """As far as PROJ knows it; local coordinates have none."""
+    _, found, classes, row_id = classified
+    path = tmp_path / "classified.laz"
+    part = replace(found.cloud, crs=parse_crs(crs), vertical=vertical)
+    write_classified(part, lambda part: (classes, row_id), path)
+    back = laspy.read(path).header.parse_crs()
+    assert horizontal(back) == part.crs
+    known = crs != "local" and vertical in ("EGM96 height", "ellipsoidal height")
+    assert vertical_name(back) == (vertical if known else None)

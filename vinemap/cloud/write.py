@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinemap.geo.crs import vertical_unit, with_vertical
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
@@ -41,7 +43,8 @@ def write_classified(
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(cloud.extent[0])
-    header.add_crs(cloud.crs)
+    crs = with_vertical(cloud.crs, cloud.vertical)
+    header.add_crs(crs if vertical_unit(crs) == 1.0 else cloud.crs)  # as some datums are known in feet alone
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams("HeightAboveGround", "float32", "metres above the terrain model"),

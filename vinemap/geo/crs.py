@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import shapely
 from pyproj import CRS, Proj, Transformer
+from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
 
 from vinemap.errors import InputError
@@ -180,6 +181,20 @@ def _in_metres(name: str) -> str:
 def is_ellipsoidal(vertical: str) -> bool:
     """Whether a vertical datum, by its name, is the ellipsoid."""
     return "ellipsoid" in vertical.lower()
+
+
+def with_vertical(flat: CRS, vertical: str | None) -> CRS:
+    """A horizontal CRS with heights above a datum by its name; as it is where PROJ knows none of that name."""
+    if vertical is None or is_local(flat):
+        return flat
+    if is_ellipsoidal(vertical):
+        return flat.to_3d()
+    try:
+        datum = CRS.from_user_input(vertical)
+    except CRSError:
+        return flat
+    known = datum.is_vertical and datum.name == vertical
+    return CompoundCRS(f"{flat.name} + {vertical}", [flat, datum]) if known else flat
 
 
 def vertical_unit(crs: CRS) -> float:

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pyproj import CRS
-from pyproj.crs import CompoundCRS
-from pyproj.exceptions import CRSError
 from pyproj.transformer import AreaOfInterest, TransformerGroup
 
-from vinemap.geo.crs import is_ellipsoidal, to_wgs84
+from vinemap.geo.crs import is_ellipsoidal, to_wgs84, with_vertical
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,18 +49,15 @@ def find_geoid(vertical: str | None, crs: CRS, at: ArrayLike, *, given: float | 
         return _level(0.0, "none: the cloud states no vertical datum, its heights are taken as they are")
     if is_ellipsoidal(vertical):
         return _level(0.0, "none: the cloud's heights are ellipsoidal")
-    try:
-        datum = CRS.from_user_input(vertical)
-    except CRSError:
-        datum = None
-    if datum is None or not datum.is_vertical or datum.name != vertical:
+    whole = with_vertical(crs, vertical)
+    if not whole.is_compound:
         return _level(0.0, f"none: PROJ doesn't know {vertical!r}, heights are taken as they are")
     points = np.atleast_2d(np.asarray(at, dtype=float))
     lat, lon, _ = to_wgs84(points, crs)[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of grids that are missing
         group = TransformerGroup(
-            CompoundCRS(vertical, [crs, datum]),
+            whole,
             CRS.from_epsg(4979),
             always_xy=True,
             area_of_interest=AreaOfInterest(lon, lat, lon, lat),
