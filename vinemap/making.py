@@ -99,7 +99,7 @@ def make_product(
             remarks = write_product(draft, record, layers, rasters, meshes, points, **how)
             if cut:
                 classify = partial(classify_points, leaves=find_leaves(*cut, settings))
-                write_classified(cut[0], classify, paths.classified_cloud(draft, parcel))
+                write_classified(cut[0], classify, paths.classified_cloud(draft, parcel), flown=recipe.flown)
             written.result()
             return remarks
 

@@ -1,6 +1,7 @@
 """Classes and rows of a cloud's points."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import laspy
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 from vinemap.canopy.classification import CANOPY, GROUND, NOISE, OTHER, classify_points
 from vinemap.canopy.model import find_canopies
 from vinemap.chain import map_rows
+from vinemap.cloud.files import date_of
 from vinemap.cloud.points import PointCloud
 from vinemap.cloud.write import write_classified
 from vinemap.config.settings import Settings
 from vinemap.geo.crs import horizontal, parse_crs, vertical_name
+
+FLOWN = datetime(2024, 6, 1, tzinfo=UTC)
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +69,14 @@ def test_a_cloud_without_canopy(cloud):
 def test_file_read_back(classified, tmp_path):
     flown, found, classes, row_id = classified
     path = tmp_path / "classified.laz"
-    write_classified(found.cloud, lambda part: (classes, row_id), path)
+    write_classified(found.cloud, lambda part: (classes, row_id), path, flown=FLOWN)
     back = laspy.read(path)
     assert np.abs(back.xyz - flown.xyz).max() < 0.001
     assert (np.asarray(back.classification) == classes).all()
     assert (np.asarray(back["row_id"]) == row_id).all()
     assert np.abs(np.asarray(back["HeightAboveGround"]) - found.cloud.heights).max() < 1e-4
     assert back.header.parse_crs().to_epsg() == 32632
+    assert date_of(path) == FLOWN
 
 
 @pytest.mark.parametrize(
@@ -83,7 +88,7 @@ def test_the_datum_of_heights_is_kept(classified, tmp_path, crs, vertical):
     _, found, classes, row_id = classified
     path = tmp_path / "classified.laz"
     part = replace(found.cloud, crs=parse_crs(crs), vertical=vertical)
-    write_classified(part, lambda part: (classes, row_id), path)
+    write_classified(part, lambda part: (classes, row_id), path, flown=FLOWN)
     back = laspy.read(path).header.parse_crs()
     assert horizontal(back) == part.crs
     known = crs != "local" and vertical in ("EGM96 height", "ellipsoidal height")

@@ -10,6 +10,7 @@ from vinemap.geo.crs import vertical_unit, with_vertical
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from datetime import datetime
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -19,7 +20,11 @@ if TYPE_CHECKING:
 
 
 def write_classified(
-    cloud: Cloud, classify: Callable[[PointCloud], tuple[NDArray[np.uint8], NDArray[np.uint16]]], path: Path
+    cloud: Cloud,
+    classify: Callable[[PointCloud], tuple[NDArray[np.uint8], NDArray[np.uint16]]],
+    path: Path,
+    *,
+    flown: datetime,
 ) -> None:
     """Write a LAZ file (LAS 1.4) of points with ``Classification``, ``HeightAboveGround`` (m) and ``row_id``.
 
@@ -31,6 +36,8 @@ def write_classified(
         Gives the class and the row (n,) of every point of a part of the cloud.
     path : Path
         The file.
+    flown : datetime
+        Day of the flight, which its header states.
 
     Raises
     ------
@@ -41,6 +48,7 @@ def write_classified(
     from lazrs import LazrsError
 
     header = laspy.LasHeader(version="1.4", point_format=6)
+    header.creation_date = flown.date()
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(cloud.extent[0])
     crs = with_vertical(cloud.crs, cloud.vertical)
