@@ -107,17 +107,19 @@ def test_a_cloud_that_moved_is_the_same(done):
 
 
 def test_a_cloud_does_not_take_the_place_of_another(done, tmp_path):
-    """Of the same name, in another folder; one that has changed, or was moved, is the same."""
-    other, moved = tmp_path / "other.las", tmp_path / "june" / "may.las"
+    """Of the same name, in another folder; one that has changed, was moved, or stands in its folder is the same."""
+    moved = tmp_path / "june" / "may.las"
     moved.parent.mkdir()
     shutil.copy(done.cloud, moved)
-    for cloud in (done.cloud, moved):
-        check_same(done.folder, [other, cloud])
+    check_same(done.folder, [moved])
     os.truncate(moved, 999)
-    with pytest.raises(OutputError, match=f"holds the products of {done.cloud}: give another folder with --out"):
-        check_same(done.folder, [other, moved])
     os.truncate(done.cloud, 999)
-    check_same(done.folder, [done.cloud])
+    tiles = [tmp_path / "1.las", tmp_path / "2.las"]
+    for clouds in ([done.cloud], [done.cloud.with_suffix(".laz")], tiles):
+        check_same(done.folder, clouds)
+    for clouds in ([moved], tiles[:1], [moved, moved.with_name("more.las")]):
+        with pytest.raises(OutputError, match=f"holds the products of {done.cloud}: give another folder with --out"):
+            check_same(done.folder, clouds)
     check_same(tmp_path / "new", [moved])
 
 

@@ -200,7 +200,8 @@ def check_same(folder: Path, clouds: Sequence[Path]) -> None:
     folder : Path
         Folder of products' folders.
     clouds : sequence of Path
-        Files that are to be mapped there: one must lie where one of the earlier lay, or have its name and size.
+        Files that are to be mapped there: one must lie where one of the earlier lay, in whatever format, or have its
+        name and size; of several it is enough that one lies in the same folder.
 
     Raises
     ------
@@ -208,13 +209,15 @@ def check_same(folder: Path, clouds: Sequence[Path]) -> None:
         If it holds products of others.
     """
     earlier = _earlier(folder).sources if places_of(folder) else []
-    places = {one.path.absolute() for one in earlier}
-    files = {(one.path.name, *one.stamp[:1]) for one in earlier}
-    same = [
-        cloud.absolute() in places or (cloud.is_file() and (cloud.name, cloud.stat().st_size) in files)
-        for cloud in clouds
-    ]
-    if earlier and not any(same):
+    known = {(one.path.name, *one.stamp[:1]) for one in earlier}
+    known |= {(one.path.absolute().parent, paths.bare(one.path)) for one in earlier}
+    known |= {(one.path.absolute().parent,) for one in earlier if len(clouds) > 1}
+    for cloud in clouds:
+        place = cloud.absolute().parent
+        size = cloud.stat().st_size if cloud.is_file() else None
+        if known & {(cloud.name, size), (place, paths.bare(cloud)), (place,)}:
+            return
+    if earlier:
         raise OutputError(f"{folder}: holds the products of {earlier[0].path}: give another folder with --out")
 
 
