@@ -22,6 +22,7 @@ from vinemap.naming import LONGEST_NAME, MOST_BYTES
 from vinemap.plugin.install import write_zip
 from vinemap.product import store
 from vinemap.product.geopackage import write_layer
+from vinemap.product.register import file
 from vinemap.product.register.file import make_register
 from vinemap.product.seasons.products import read_record
 from vinemap.view.window import show
@@ -42,6 +43,17 @@ def test_a_file_that_cannot_be_written_is_said_in_a_line(tmp_path, write):
     with pytest.raises(OutputError, match=r"a/b: can't be written \((File exists|Not a directory)\): choose another"):
         write(tmp_path / "a" / "b")
     assert names(tmp_path) == ["a"]
+
+
+def test_a_register_for_which_there_is_no_room_leaves_nothing(tmp_path, monkeypatch):
+    def full(tables, path, **how):
+        path.with_name(f"{path.name}-journal").touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(file, "write_geopackage", full)
+    with pytest.raises(OutputError, match=r"r\.gpkg: can't be written \(No space left on device\): make room there"):
+        make_register(tmp_path / "r.gpkg", CRS.from_epsg(32632))
+    assert names(tmp_path) == []
 
 
 def test_folder_that_cannot_be_written(tmp_path):

@@ -88,6 +88,7 @@ def _write_layers(layers: Mapping[str, gpd.GeoDataFrame], path: Path, contract: 
         with warnings.catch_warnings():
             # An empty column of text has no type of its own to infer.
             warnings.simplefilter("ignore", UserWarning)
+            warnings.simplefilter("ignore", RuntimeWarning)  # GDAL's remarks where the disk is full
             pyogrio.write_dataframe(
                 tables[name],
                 path,

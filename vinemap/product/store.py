@@ -175,6 +175,8 @@ def write_whole(path: Path, text: str) -> None:
 def drafted(path: Path, suffix: str = "") -> Iterator[Path]:
     """Give a file's draft beside it, which takes the file's place if all goes well, and goes if it doesn't.
 
+    What SQLite leaves beside a draft where the disk is full goes, too.
+
     Raises
     ------
     OSError
@@ -185,8 +187,9 @@ def drafted(path: Path, suffix: str = "") -> Iterator[Path]:
         yield draft
         draft.replace(path)
     finally:
-        with suppress(OSError):  # it took it, or was never there
-            draft.unlink()
+        for left in (draft, draft.with_name(f"{draft.name}-journal")):
+            with suppress(OSError):  # it took it, or was never there
+                left.unlink()
 
 
 def unwritable(place: Path, error: OSError) -> OutputError:

@@ -31,7 +31,7 @@ from vinemap.product.register.tables import (
     read_tables,
     write_update,
 )
-from vinemap.product.store import drafted
+from vinemap.product.store import FULL, drafted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -121,7 +121,8 @@ def make_register(path: Path, crs: CRS) -> None:
                 with drafted(path, ".gpkg") as draft:
                     write_geopackage(tables, draft, contract=REGISTER)
     except OSError as error:
-        raise OutputError(f"{path}: can't be written ({error.strerror or error}): choose another file") from error
+        advice = "make room there" if error.errno in FULL else "choose another file"
+        raise OutputError(f"{path}: can't be written ({error.strerror or error}): {advice}") from error
 
 
 def _empty(layer: Layer, crs: CRS) -> gpd.GeoDataFrame:
