@@ -30,7 +30,7 @@ def test_boundary_of_the_named_parcel_or_of_all(tmp_path):
     assert read_boundary(path, parcel="Ba")[0].equals(squares[1])
     assert read_boundary(path)[0].area == pytest.approx(2.7)
     with pytest.raises(InputError, match="did you mean 'Ba'"):
-        read_boundary(path, parcel="Baa")
+        read_boundary(path, parcel="BAA")
 
 
 def polygons(path, **columns):

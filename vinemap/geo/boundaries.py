@@ -190,8 +190,9 @@ def _found(
         made = _made(table, np.arange(1), path)
         told = f"the only polygon of {path.name} was taken, though none of its columns says {name!r}"
         return made if isinstance(made, InputError) else made._replace(remarks=(*made.remarks, told))
-    close = difflib.get_close_matches(name, sorted({word for rows in places for word in rows}), n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}?" if close else "check the name"
+    lower = {word.lower(): word for rows in places for word in sorted(rows)}
+    close = difflib.get_close_matches(word.lower(), sorted(lower), n=1, cutoff=0.5)
+    hint = f"did you mean {lower[close[0]]!r}?" if close else "check the name"
     n = np.count_nonzero(table.area)
     return InputError(f"{path}: none of its {n} polygons has {name!r} in a column: {hint}")
 
