@@ -18,7 +18,8 @@ from vinemap import paths
 from vinemap.config.surveys import load_estate, load_survey
 from vinemap.errors import BusyError, VinemapError, own_fault
 from vinemap.jobs.estate import Arrival, arrivals
-from vinemap.jobs.plan import COLUMNS, FAILED, Outcome, in_table, plan_survey
+from vinemap.jobs.outcomes import COLUMNS, FAILED, Outcome, in_table
+from vinemap.jobs.plan import plan_survey
 from vinemap.jobs.survey import map_survey
 from vinemap.terminal import plain_errors, show
 

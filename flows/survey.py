@@ -17,7 +17,7 @@ from prefect.states import Completed, Failed
 from vinemap.errors import VinemapError
 from vinemap.example import ensure_cloud
 from vinemap.jobs.configured import chosen
-from vinemap.jobs.plan import COLUMNS, FAILED, Outcome, in_table
+from vinemap.jobs.outcomes import COLUMNS, FAILED, Outcome, in_table
 from vinemap.jobs.survey import map_survey
 from vinemap.terminal import plain_errors, tell
 

@@ -18,6 +18,7 @@ REMARKS = {
     "geo/lines.py",
     "geo/place.py",
     "jobs/estate.py",
+    "jobs/outcomes.py",
     "jobs/plan.py",
     "jobs/register.py",
     "product/notices.py",

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rich.progress import Progress, ProgressColumn
 
-    from vinemap.jobs.plan import Outcome
+    from vinemap.jobs.outcomes import Outcome
 
 T = TypeVar("T")
 
@@ -73,7 +73,7 @@ def show(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 def tell(outcomes: Sequence[Outcome]) -> None:
     """Print what became of parcels, and end with exit code 1 if one failed."""
-    from vinemap.jobs.plan import COLUMNS, FAILED, in_table
+    from vinemap.jobs.outcomes import COLUMNS, FAILED, in_table
 
     show(COLUMNS, in_table(outcomes))
     if failed := sum(outcome.state == FAILED for outcome in outcomes):

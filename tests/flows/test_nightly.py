@@ -17,7 +17,7 @@ from squares import Job, left
 from vinemap import paths
 from vinemap.jobs import survey as jobs
 from vinemap.jobs.estate import Arrival
-from vinemap.jobs.plan import CURRENT
+from vinemap.jobs.outcomes import CURRENT
 from vinemap.product import recipe
 from vinemap.simulate.survey import write_survey
 

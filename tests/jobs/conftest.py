@@ -6,7 +6,7 @@ from products import without_workers
 from squares import Job
 
 from vinemap.jobs import survey
-from vinemap.jobs.plan import DONE
+from vinemap.jobs.outcomes import DONE
 from vinemap.jobs.workers import Worker
 
 

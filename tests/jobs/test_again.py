@@ -13,7 +13,7 @@ from vinemap import paths
 from vinemap.cloud.las import read_cloud
 from vinemap.errors import OutputError
 from vinemap.jobs import survey
-from vinemap.jobs.plan import CURRENT, DONE, FAILED, check_same
+from vinemap.jobs.outcomes import CURRENT, DONE, FAILED, check_same
 from vinemap.product import recipe
 from vinemap.product.seasons.products import GONE, places_of
 

@@ -18,7 +18,7 @@ from vinemap.config.surveys import survey_config
 from vinemap.errors import ConfigError, WorkerError
 from vinemap.jobs import survey
 from vinemap.jobs.dask import DaskWorkers
-from vinemap.jobs.plan import DONE
+from vinemap.jobs.outcomes import DONE
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import follow
 

@@ -18,7 +18,7 @@ from vinemap.cloud.pieces import split_cloud
 from vinemap.compute.processes import descendants
 from vinemap.errors import BusyError, InputError, OutputError, VinemapError
 from vinemap.jobs import survey
-from vinemap.jobs.plan import CURRENT, DONE, FAILED
+from vinemap.jobs.outcomes import CURRENT, DONE, FAILED
 from vinemap.product import recipe, store
 
 

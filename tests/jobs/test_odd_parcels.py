@@ -16,7 +16,7 @@ from vinemap.cloud.tiles import Collector
 from vinemap.errors import InputError
 from vinemap.geo.boundaries import read_parcels
 from vinemap.jobs import survey
-from vinemap.jobs.plan import CURRENT, DONE, FAILED, OUTSIDE
+from vinemap.jobs.outcomes import CURRENT, DONE, FAILED, OUTSIDE
 from vinemap.product import recipe
 from vinemap.product.seasons.products import GONE
 

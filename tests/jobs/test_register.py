@@ -13,7 +13,8 @@ from products import map_here, place_product
 
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError
-from vinemap.jobs.plan import CURRENT, DONE, LEFT, plan_survey
+from vinemap.jobs.outcomes import CURRENT, DONE, LEFT
+from vinemap.jobs.plan import plan_survey
 from vinemap.jobs.register import is_due, note, register_products
 from vinemap.jobs.survey import map_survey
 from vinemap.product.register import file

@@ -24,7 +24,8 @@ from vinemap.cloud.tiles import Collector
 from vinemap.config.surveys import survey_config
 from vinemap.errors import InputError, OutputError, WorkerError
 from vinemap.geo.boundaries import read_boundary
-from vinemap.jobs.plan import CURRENT, DONE, FAILED, LEFT, plan_survey
+from vinemap.jobs.outcomes import CURRENT, DONE, FAILED, LEFT
+from vinemap.jobs.plan import plan_survey
 from vinemap.jobs.survey import map_survey
 from vinemap.parcel import map_parcel
 from vinemap.product.recipe import product_in

@@ -64,7 +64,7 @@ def survey(
     from vinemap import paths
     from vinemap.cloud.files import cloud_files
     from vinemap.config.surveys import load_settings, survey_config
-    from vinemap.jobs.plan import FAILED, check_same
+    from vinemap.jobs.outcomes import FAILED, check_same
     from vinemap.jobs.survey import map_survey
 
     files = cloud_files(clouds)

@@ -2,68 +2,29 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from vinemap import __version__, paths
+from vinemap import paths
 from vinemap.config.names import check_parcel
-from vinemap.errors import ConfigError, InputError, OutputError
+from vinemap.errors import ConfigError, InputError
 from vinemap.geo.boundaries import NoAreaError, Parcel, read_parcels
 from vinemap.geo.crs import is_local, parse_crs
 from vinemap.geo.layers import read_points, some_of
 from vinemap.geo.lines import KnownRows, read_rows, rows_of
+from vinemap.jobs.outcomes import CURRENT, DONE, FAILED, LEFT, OUTSIDE, Outcome, earlier_in
 from vinemap.jobs.register import Known, candidates_due, known_of
 from vinemap.product.recipe import VINES, Recipe, Source, fit_for, flown, product_in, read_clouds, read_source, vines_of
-from vinemap.product.record import in_words
-from vinemap.product.seasons.products import GONE, places_of, whose
-from vinemap.product.store import write_whole
+from vinemap.product.seasons.products import GONE, whose
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
+    from datetime import datetime
 
     import geopandas as gpd
 
     from vinemap.config.surveys import SurveyConfig
     from vinemap.geo.boundaries import Boundary
-
-DONE, CURRENT, OUTSIDE, LEFT, FAILED = "done", "up to date", "not in the cloud", "left out", "failed"
-"""What can become of a parcel, beside that it is ``GONE``."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a parcel."""
-
-    parcel: str
-    state: str
-    rows: int = 0
-    length: float = 0.0
-    """Of all rows (m)."""
-    seconds: float = 0.0
-    reason: str = ""
-    """Why it failed, or what is to be known of it."""
-    heals: bool = False
-    """Whether it may go well another time, with the same input."""
-    key: str = ""
-    """Of the recipe."""
-
-    def line(self) -> str:
-        """What became of the parcel, as a sentence."""
-        what = f"{in_words(self.rows, self.length)}, in {self.seconds:.1f} s" if self.state == DONE else self.state
-        colon = "; " if self.state == DONE else ": "
-        return f"{self.parcel}: {what}{colon if self.reason else ''}{' '.join(self.reason.split())}"
-
-
-COLUMNS = ("parcel", "rows", "seconds", "state", "reason")
-"""Of a table of what became of parcels."""
-
-
-def in_table(outcomes: Iterable[Outcome]) -> list[tuple[str, ...]]:
-    """What became of parcels in words, as rows of a table of ``COLUMNS``."""
-    return [(o.parcel, str(o.rows), f"{o.seconds:.1f}", o.state, " ".join(o.reason.split())) for o in outcomes]
 
 
 class Plan(NamedTuple):
@@ -82,13 +43,6 @@ class Plan(NamedTuple):
         """Parcels whose rows the register is to be offered, after what became of them."""
         mapped = {one.parcel: one.state == DONE for one in outcomes if one.state in (DONE, CURRENT) and one.rows}
         return candidates_due(self.register, self.flown, mapped)
-
-
-class _Earlier(NamedTuple):
-    """What the last job in a folder has left."""
-
-    sources: list[Source]
-    outcomes: dict[str, Outcome]
 
 
 def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> Plan:
@@ -112,7 +66,7 @@ def plan_survey(config: SurveyConfig, folder: Path, *, again: bool = False) -> P
     """
     cloud = config.cloud or paths.survey_cloud(config.survey)
     boundaries = config.boundaries or paths.survey_boundaries(config.survey)
-    hashed, known = _earlier(folder)
+    hashed, known = earlier_in(folder)
     clouds = read_clouds(cloud, hashed)
     polygons: dict[str, Parcel | InputError | None]
     crs, listed = parse_crs(config.crs) if config.crs else None, config.parcels is not None
@@ -190,35 +144,6 @@ def outside(recipe: Recipe, folder: Path) -> Outcome:
     stays = "its earlier product stays, of another cloud or polygon"
     reason = stays if there and there.parcel == recipe.parcel else ""
     return Outcome(recipe.parcel, OUTSIDE, reason=reason, key=recipe.key)
-
-
-def check_same(folder: Path, clouds: Sequence[Path]) -> None:
-    """Make sure that a folder of products is no other survey's, as clouds' names alone don't tell them apart.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of products' folders.
-    clouds : sequence of Path
-        Files that are to be mapped there: one must lie where one of the earlier lay, in whatever format, or have its
-        name and size; of several it is enough that one lies in the same folder.
-
-    Raises
-    ------
-    OutputError
-        If it holds products of others.
-    """
-    earlier = _earlier(folder).sources if places_of(folder) else []
-    known = {(one.path.name, *one.stamp[:1]) for one in earlier}
-    known |= {(one.path.absolute().parent, paths.bare(one.path)) for one in earlier}
-    known |= {(one.path.absolute().parent,) for one in earlier if len(clouds) > 1}
-    for cloud in clouds:
-        place = cloud.absolute().parent
-        size = cloud.stat().st_size if cloud.is_file() else None
-        if known & {(cloud.name, size), (place, paths.bare(cloud)), (place,)}:
-            return
-    if earlier:
-        raise OutputError(f"{folder}: holds the products of {earlier[0].path}: give another folder with --out")
 
 
 def elsewhere(config: SurveyConfig, outcomes: Iterable[Outcome]) -> list[Outcome]:
@@ -320,37 +245,3 @@ def _whole(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Parc
 def _bounds(polygons: Mapping[str, Parcel | InputError | None]) -> dict[str, Boundary | None]:
     """Boundaries of the parcels whose polygons could be read; None of those that need none."""
     return {name: one.boundary if one else None for name, one in _whole(polygons).items()}
-
-
-def _earlier(folder: Path) -> _Earlier:
-    """What the last job in a folder has left, if it can be read."""
-    try:
-        record = json.loads(paths.survey_record(folder).read_text(encoding="utf-8"))
-        sources = [
-            Source(Path(s["path"]), str(s["sha256"]), tuple(s["stamp"]), float(s["read"])) for s in record["sources"]
-        ]
-        outcomes = {one["parcel"]: Outcome(**one) for one in record["parcels"] if isinstance(one["parcel"], str)}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return _Earlier([], {})
-    return _Earlier(sources, outcomes)
-
-
-def write_record(folder: Path, survey: str, plan: Plan, outcomes: Iterable[Outcome], began: datetime) -> None:
-    """Write ``survey.json``: what became of each parcel, for people and for the next job.
-
-    Raises
-    ------
-    OSError
-        If it can't be written.
-    """
-    known = _earlier(folder).outcomes if plan.listed else {}
-    known |= {o.parcel: replace(o, state=DONE if o.state == CURRENT else o.state) for o in outcomes}
-    record = {
-        "vinemap": __version__,
-        "survey": survey,
-        "began": began.isoformat(timespec="seconds"),
-        "seconds": round((datetime.now(UTC) - began).total_seconds(), 3),
-        "sources": [{"path": str(s.path), "sha256": s.sha256, "stamp": s.stamp, "read": s.read} for s in plan.sources],
-        "parcels": [asdict(known[name]) for name in sorted(known)],
-    }
-    write_whole(paths.survey_record(folder), json.dumps(record, indent=2, ensure_ascii=False))

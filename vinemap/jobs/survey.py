@@ -18,7 +18,8 @@ from vinemap.cloud.pdal.engine import check_engines
 from vinemap.cloud.pieces import split_cloud
 from vinemap.compute import machine
 from vinemap.errors import ConfigError, InputError, OutsideError, VinemapError, WorkerError, own_fault
-from vinemap.jobs.plan import DONE, FAILED, LEFT, Outcome, Plan, elsewhere, outside, plan_survey, write_record
+from vinemap.jobs.outcomes import DONE, FAILED, LEFT, Outcome, write_record
+from vinemap.jobs.plan import Plan, elsewhere, outside, plan_survey
 from vinemap.jobs.register import is_due, note
 from vinemap.jobs.workers import Worker, Workers
 from vinemap.parcel import follow
@@ -107,7 +108,7 @@ def map_survey(
             raise
         finally:
             if outcomes:
-                write_record(folder, config.survey, plan, outcomes, began)
+                write_record(folder, config.survey, plan.sources, outcomes, began=began, listed=plan.listed)
                 given = [(source.path, source.record()) for source in plan.sources]
                 products = write_collection(folder, survey=config.survey, flown=plan.flown, sources=given)
                 _write_tileset(paths.tileset(folder), products)

@@ -62,7 +62,7 @@ def test_a_survey_is_read_once(stand_in, pdal, tmp_path, survey, vineyard, monke
     given["overrides"] = {name: {"settings": {"ground": {"engine": "vinemap"}}} for name in "cd"}
     config = survey_config(survey="strips", cloud=survey, boundaries=boundaries, **given)
     without_workers(monkeypatch)
-    dealt = job._jobs(plan_survey(config, tmp_path), config, tmp_path)
+    dealt = job._jobs(plan_survey(config, tmp_path), config, tmp_path, tmp_path)
     pieces = {recipe.parcel: piece for recipe, piece in dealt}
     assert (tmp_path / "read").read_text() == f"{survey.name}\n"
     assert sorted(pieces) == list("abcd")
