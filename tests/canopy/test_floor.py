@@ -60,11 +60,20 @@ def test_weeds_that_stand_only_under_vines_are_no_canopy():
         assert usual < 0.35
 
 
-@pytest.mark.parametrize("bottom", [0.05, 0.55])
-def test_tall_rows_keep_their_floor(bottom):
+@pytest.mark.parametrize(("bottom", "floor"), [(0.15, 0.15), (0.55, 0.4)])
+def test_tall_rows_begin_at_the_margin_or_where_their_foliage_ends_below(bottom, floor):
     rng = np.random.default_rng(0)
-    floor, usual = floor_of(ground(rng), block(rng, 6000, 0.25, bottom, 1.9))
-    assert floor == usual
+    assert floor_of(ground(rng), block(rng, 6000, 0.25, bottom, 1.9))[0] == pytest.approx(floor, abs=0.051)
+
+
+def test_weeds_that_stand_out_on_both_sides_of_tall_rows_are_no_canopy():
+    """Whether they end below the foliage or within it, but not if they stand on one side, or as high as can be told."""
+    rng = np.random.default_rng(0)
+    foliage, weeds = block(rng, 8000, 0.25, 0.7, 1.9), block(rng, 4000, 0.5, 0, 0.6)
+    assert floor_of(ground(rng), foliage, weeds)[0] == pytest.approx(0.6, abs=0.06)
+    assert floor_of(ground(rng), block(rng, 8000, 0.25, 0.5, 1.9), weeds)[0] == pytest.approx(0.5, abs=0.06)
+    assert floor_of(ground(rng), foliage, weeds[weeds[:, 0] < 0.25])[0] == 0.4
+    assert floor_of(ground(rng), foliage, block(rng, 40000, 1.2, 0, 1.5))[0] == 0.4
 
 
 @pytest.mark.parametrize("density", [150, 1500])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinemap.canopy.points import NO_SECTIONS, STICKING, USUAL_AREA, canopy_floor, canopy_size, is_post
+from vinemap.canopy.points import MARGIN, NO_SECTIONS, STICKING, USUAL_AREA, canopy_floor, canopy_size, is_post
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
 
@@ -48,7 +48,7 @@ NO_CANOPY = Canopy(NO_SECTIONS, np.empty((0, 3, 2)), np.empty(0))
 def separate_canopy(
     sections: Sections,
     *,
-    margin: float = 0.4,
+    margin: float = MARGIN,
     half_width: float | None = None,
     high: float = 3.6,
     min_neighbours: float = 0.02,
@@ -65,7 +65,8 @@ def separate_canopy(
     sections : Sections
         All points of every section of a row.
     margin : float
-        Metres above plane and terrain at which canopy begins, or less where the row is low.
+        Metres above plane and terrain at which canopy begins, less where the row is low or its foliage goes on below,
+        more where weeds stand in it.
     half_width : float, optional
         Metres to the side of γ at which canopy ends; by default what holds the row's, half its spacing at the most.
     high : float
@@ -82,8 +83,8 @@ def separate_canopy(
         across = sections.points[:, 0].copy()
         top, half = canopy_size(across, sections.height, spacing, high)
         half_width = half if half_width is None else half_width
-        floor = canopy_floor(across, sections.height, (top, half), spacing)
-        margin, min_height = min(margin, floor), min(min_height, UPPER * top)
+        margin = canopy_floor(across, sections.height, (top, half), spacing, margin)
+        min_height = min(min_height, UPPER * top)
     keep = np.zeros(len(sections.points), dtype=bool)
     walls, tall = np.zeros((m, 2, 2)), np.zeros(m)
     limits = (margin, half_width or 0.0, high, min_neighbours, min_height, top)

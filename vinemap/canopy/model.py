@@ -64,11 +64,11 @@ def find_canopies(
     settings : Settings
         Of sections, canopy and the heights of the cover.
     """
-    low, high = settings.cover.low, settings.cover.high
-    options = settings.canopy.model_dump()
+    low, high, margin = settings.cover.low, settings.cover.high, settings.canopy.margin
+    cut, options = settings.sections.model_dump(), settings.canopy.model_dump()
     living = {name: options.pop(name) for name in ("min_points", "min_share")}
     separate = partial(separate_canopy, high=high, **options)
-    canopies = cut_sections(cloud, rows, gaps, dtm, separate, low=low, high=high, **settings.sections.model_dump())
+    canopies = cut_sections(cloud, rows, gaps, dtm, separate, low=low, high=high, margin=margin, **cut)
     return living_canopies(canopies, **living)
 
 

@@ -41,6 +41,10 @@ than so many times the least above, as it is where another plant begins; and if 
 beside the row."""
 SURE = 3.0
 """Standard deviations of the number of points by which a rise is none of chance."""
+AS_DENSE = 0.35
+"""Share of a row's density, at a height, that stands on both sides of its canopy where these are weeds."""
+MARGIN = 0.4
+"""Metres above ground from which points are a canopy's, unless they say otherwise."""
 
 
 def above_weeds(height: Values | float) -> Values:
@@ -49,12 +53,15 @@ def above_weeds(height: Values | float) -> Values:
     return out
 
 
-def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacing: float) -> float:
+def canopy_floor(
+    left: Values, height: Values, size: tuple[float, float], spacing: float, margin: float = MARGIN
+) -> float:
     """Metres above ground from which a row's points are its canopy's.
 
-    That is where canopies are told from weeds by their height alone. In low rows it is lower, as far as their foliage
-    goes on and next to nothing stands beside it that could be weeds or the soil's noise; or higher, where foliage has
-    thinned out and something denser begins below.
+    That is a margin, or in low rows where canopies are told from weeds by their height alone. It is lower as far as
+    their foliage goes on and next to nothing stands beside it that could be weeds or the soil's noise. It is higher
+    where weeds stand: in low rows where foliage has thinned out and something denser begins below; in others, whose
+    foliage may be thin above where it hides itself, where something stands on both sides of it that doesn't higher up.
 
     Parameters
     ----------
@@ -64,27 +71,46 @@ def canopy_floor(left: Values, height: Values, size: tuple[float, float], spacin
         Height and half width of the row, as of :func:`canopy_size`.
     spacing : float
         Metres to the next row.
+    margin : float
+        Metres above ground at which the canopy of a row that isn't low begins.
     """
     top, half = size
-    floor = float(above_weeds(top))
-    if top >= LOWLY:
-        return floor
+    floor = min(margin, float(above_weeds(top)))
     inner = _edge(half)
     strips = np.array([0.0, inner, WIDER * inner, half, max(half, 0.5 * spacing)])
     density = _densities(left, height, strips, round(top / BIN))
     inside, beside = density[0], density[2:].max(axis=0)
-    level = int(floor / BIN)
+    level = int(round(floor / BIN, 6))
     above = inside[level + 1 :]
     if not above.any():
         return floor
     upper = max(int(UPPER * top / BIN) - level - 1, 0)
     lower = above[: upper + above[upper:].argmax() + 1]
     usual, least = above.mean(), lower.min()
-    if inner * (inside[level] - RISE * least) > SURE * np.sqrt(inner * inside[level]):
-        return max(floor, (level + 1 + int((lower <= RISE * least).argmax())) * BIN)
+    if top < LOWLY:
+        if inner * (inside[level] - RISE * least) > SURE * np.sqrt(inner * inside[level]):
+            return max(floor, (level + 1 + int((lower <= RISE * least).argmax())) * BIN)
+    else:
+        weeds = _weeds(left, height, strips[[0, 2, 3]], inside)[level : level + upper + 2]
+        if weeds.any() and not weeds[-1]:
+            highest = int(np.flatnonzero(weeds)[-1])
+            free = above[highest : upper + 1]
+            return max(floor, (level + highest + int((free <= RISE * free.min()).argmax()) + 1) * BIN)
     while level > 0 and SOLID * usual <= inside[level] <= RISE * least and beside[level] <= CLEAR * inside[level]:
         floor, least, level = min(floor, level * BIN), min(least, inside[level]), level - 1
     return floor
+
+
+def _weeds(left: Values, height: Values, strips: Values, inside: Values) -> Flags:
+    """Whether weeds stand at levels (k,) of height on both sides of a row, in the outer of two strips.
+
+    They are ``AS_DENSE`` of what stands ``inside`` (k,), at the least, not by chance, with the levels below and above.
+    """
+    width, window = strips[2] - strips[1], np.ones(3)
+    sides = [_densities(left[side], height[side], strips, len(inside))[1] for side in (left < 0, left >= 0)]
+    aside = 2 * width * np.minimum(*(np.convolve(side, window, "same") for side in sides))
+    out: Flags = aside - AS_DENSE * width * np.convolve(inside, window, "same") > SURE * np.sqrt(aside)
+    return out
 
 
 def canopy_area(size: tuple[float, float], floor: float) -> float:

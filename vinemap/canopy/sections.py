@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import shapely
 
-from vinemap.canopy.points import USUAL_AREA, Sections, canopy_area, canopy_floor, canopy_size
+from vinemap.canopy.points import MARGIN, USUAL_AREA, Sections, above_weeds, canopy_area, canopy_floor, canopy_size
 from vinemap.cloud.frame import points_of_rows
 from vinemap.compute.compiled import compiled
 from vinemap.compute.threads import in_threads, stretches
@@ -49,6 +49,7 @@ def cut_sections(
     max_width: float = 10.0,
     low: float = 0.5,
     high: float = 3.6,
+    margin: float = MARGIN,
 ) -> list[T]:
     """Cut sections along every row, except where it has no canopy (Eq. 2–3), and hand each row's to a function.
 
@@ -74,6 +75,8 @@ def cut_sections(
         canopies of more than a square metre they need as many more.
     low, high : float
         Heights in metres between which points count as canopy; the lower is less in rows that are low.
+    margin : float
+        As of :func:`vinemap.canopy.points.canopy_floor`.
 
     Returns
     -------
@@ -92,11 +95,11 @@ def cut_sections(
         canopied = _outside(bare[bare_rows == numbers[row]], stations)
         position, level = stations[canopied], soil_line[canopied]
         top, half = size = canopy_size(left, height, float(spacing[row]), high)
-        floor = canopy_floor(left, height, size, float(spacing[row]))
+        floor = canopy_floor(left, height, size, float(spacing[row]), margin)
         below = min(SOIL, floor)
         canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
         length = max(len(position) * step, step)
-        needed = min_points * max(1.0, canopy_area(size, floor) / USUAL_AREA)
+        needed = min_points * max(1.0, canopy_area(size, max(floor, float(above_weeds(top)))) / USUAL_AREA)
         a = max(width, min(max_width, needed * length / max(canopy, 1)))
         every = max(1, int(soil * a / length / SOIL_POINTS))
         n, index = _members(along, height, position, a / 2, (below, every))

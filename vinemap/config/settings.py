@@ -200,7 +200,7 @@ class CanopyOptions(Options):
     """Canopy told from terrain."""
 
     margin: float = Field(
-        0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins, less in low rows (m)"
+        0.4, ge=0, le=2, description="height above plane and terrain at which canopy begins, as a rule (m)"
     )
     half_width: float | None = Field(
         None, gt=0, le=100, description="distance from γ at which canopy ends (m); none: what holds the row's"
