@@ -48,6 +48,18 @@ def test_a_side_that_hides_its_foot_is_like_the_other():
     assert feet[:, 1, 0].mean() == pytest.approx(0.3, abs=0.03)
 
 
+def test_a_side_under_which_a_canopy_leans_is_as_far_from_the_other_as_the_canopy_is_wide():
+    rng = np.random.default_rng(2)
+    points = []
+    for _ in range(60):
+        z = rng.uniform(0.6, 1.9, 60)
+        lean = 0.4 * (z - 1.25)
+        y = lean + np.where(z < 1, rng.uniform(-0.25, -0.2, 60), rng.uniform(-0.25, 0.25, 60))
+        points.append(np.column_stack([y, z]))
+    _, feet = find_feet(many_sections(points))
+    assert feet[:, 1, 0].mean() == pytest.approx(-0.26 + 0.25, abs=0.07)
+
+
 @pytest.mark.parametrize("across", [np.zeros(50), np.linspace(-0.6, 0.6, 50)], ids=["on a line", "above 3 m"])
 def test_a_foot_of_which_sides_tell_nothing_is_where_points_thin_out(across):
     low = 0.5 if not across.any() else 3.2

@@ -77,7 +77,8 @@ def _foot(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
 def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
     """How far (2, m) to the right and left sections reach at their feet, told by those in each one's window.
 
-    A side of which next to nothing was seen there is as far as the other; a foot of which nothing was is a point.
+    A side of which next to nothing was seen there is as far as the other, but no farther from it than the canopy is
+    wide at any height, as the foot of one that leans isn't in its middle. A foot of which nothing was seen is a point.
     """
     across = canopy.points[:, 0]
     bins = math.ceil(float(np.abs(across).max(initial=FOOT_BIN)) / FOOT_BIN) + 1
@@ -89,12 +90,30 @@ def _sides(canopy: Sections, at_foot: Flags, near: tuple[Ints, Ints]) -> Values:
     right, left = (side[:, :-1] for side in shown)
     few = [side.sum(axis=1) <= FOOT_STRAYS for side in (right, left)]
     both = right + left
-    return np.array(
+    out = np.array(
         [
             _rank(np.where(one_sided[:, None], both, side), FOOT_SPREAD) * FOOT_BIN
             for side, one_sided in zip((right, left), few, strict=True)
         ]
     )
+    if np.any(few[0] != few[1]):
+        farthest = _widest(canopy, near) - _rank(both, 1 - FOOT_RANKS[0]) * FOOT_BIN
+        for side, one_sided, seen in zip(out, few, few[::-1], strict=True):
+            hidden = one_sided & ~seen
+            side[hidden] = np.minimum(side, farthest)[hidden]
+    return out
+
+
+def _widest(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
+    """Metres (m,) that sections are wide at the height at which they are widest, told by those in each one's window."""
+    across, height = (canopy.points[:, k] - canopy.points[:, k].min() for k in (0, 1))
+    bins, level = math.ceil(float(across.max()) / FOOT_BIN) + 1, np.floor(height / FOOT_BAND)
+    out = np.zeros(len(canopy.row_id))
+    for k in range(int(level.max()) + 1):
+        shown = _histograms(np.where(level == k, across, FOOT_BIN * (bins + 1)), canopy.start, 0.0, FOOT_BIN, bins + 1)
+        shown = _pooled(shown[:, :-1], near)
+        out = np.maximum(out, (_rank(shown, 1 - FOOT_RANKS[0]) - _rank(shown, FOOT_RANKS[0])) * FOOT_BIN)
+    return out
 
 
 def _window(canopy: Sections, reach: float) -> tuple[Ints, Ints]:
