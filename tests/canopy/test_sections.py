@@ -105,6 +105,18 @@ def test_sections_are_wider_where_points_are_few_for_the_canopy(per_metre, half,
     assert sections.extent == pytest.approx(width, rel=0.1)
 
 
+def test_wide_sections_do_not_reach_over_the_space_between_bushes():
+    """Of bushes of 0.8 m, 1.6 m apart, with 80 points a metre."""
+    rng = np.random.default_rng(0)
+    x = np.concatenate([rng.uniform(at, at + 0.8, 64) for at in np.arange(0, 32, 1.6)])
+    xyz = np.column_stack([x, rng.uniform(-0.4, 0.4, len(x)), rng.uniform(0.4, 1.2, len(x))])
+    sections = cut(xyz, rows_frame([np.array([[0, 0], [32.0, 0]])]), gaps_frame(), flat(-5, -5))
+    assert sections.extent.max() > 0.6
+    into = sections.position % 1.6
+    assert np.minimum(np.abs(into - 0.4), np.abs(into - 2.0)).max() < 0.61
+    assert len(sections.row_id) > 60
+
+
 def test_wide_sections_follow_the_soil_along_the_row():
     """Of a flat canopy at 1.5 m over a slope along the row a section is as thin as at a station."""
     rng, slope = np.random.default_rng(0), 0.5

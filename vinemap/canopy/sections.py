@@ -32,6 +32,9 @@ T = TypeVar("T")
 SOIL, SOIL_POINTS = 0.3, 200
 """Metres from the terrain within which points are the soil's, where no low canopy begins below, and how many of them,
 about, a section needs: dense clouds have many more, which would tell no more of the inter-row's elevation."""
+OWN, LEAST, BETWEEN = 1 / 3, 0.15, 1.0
+"""Share of the points that widened sections are to have that shows whether a station has canopy itself; share of the
+median station's that it then has, at the least; and metres up to which so many must lie, as between two bushes."""
 FOOT = 0.4
 """Share of a row's height from which points are taken for canopy, where that is less than is asked for."""
 
@@ -93,14 +96,21 @@ def cut_sections(
         stations = np.linspace(0, lines[row].length, max(2, round(lines[row].length / step) + 1))
         soil_line = sample(dtm, at(curves[row], stations))
         canopied = _outside(bare[bare_rows == numbers[row]], stations)
-        position, level = stations[canopied], soil_line[canopied]
         top, half = size = canopy_size(left, height, float(spacing[row]), high)
         floor = canopy_floor(left, height, size, float(spacing[row]), margin)
         below = min(SOIL, floor)
-        canopy, soil = _count(left, height, half, (below, min(low, FOOT * top), high))
-        length = max(len(position) * step, step)
+        levels = below, min(low, FOOT * top), high
+        canopy, soil = _count(left, height, half, levels)
+        length = max(canopied.sum() * step, step)
         needed = min_points * max(1.0, canopy_area(size, max(floor, float(above_weeds(top)))) / USUAL_AREA)
-        a = max(width, min(max_width, needed * length / max(canopy, 1)))
+        wanted = needed * length / max(canopy, 1)
+        if width < wanted <= BETWEEN / OWN and canopied.any():
+            leaves = along[(levels[1] <= height) & (height <= high) & (np.abs(left) < half)]
+            canopied &= _has_own(leaves, stations, canopied, max(width, OWN * wanted))
+            length = max(canopied.sum() * step, step)
+            wanted = needed * length / max(canopy, 1)
+        position, level = stations[canopied], soil_line[canopied]
+        a = max(width, min(max_width, wanted))
         every = max(1, int(soil * a / length / SOIL_POINTS))
         n, index = _members(along, height, position, a / 2, (below, every))
         start = np.concatenate([[0], np.cumsum(n)])
@@ -245,6 +255,17 @@ def _take_each(
         points[i, 1] = elevation[p] - levels[k] - (at_step - k) * (levels[k + 1] - levels[k])
         heights[i], members[i] = height[p], member[p]
     return points, heights, members
+
+
+def _has_own(leaves: Values, stations: Values, canopied: Flags, within: float) -> Flags:
+    """Whether stations (m,) have canopy within so many metres, of points (n,) along the row, as those that may have it.
+
+    Bushes stand apart, and what lies between two has no canopy where points are so few that sections reach both.
+    """
+    leaves = np.sort(leaves)
+    n = np.searchsorted(leaves, stations + within / 2) - np.searchsorted(leaves, stations - within / 2)
+    out: Flags = n >= LEAST * np.median(n[canopied])
+    return out
 
 
 def _outside(bare: Values, position: Values) -> Flags:
