@@ -1,11 +1,15 @@
 """Closed pieces from sections, their volume, and Open3D."""
 
+import geopandas as gpd
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 from meshes import LEANING, NOTCHED, ORIGIN, SQUARE, along, area, closed
+from sections import many_sections
 
-from vinemap.canopy.mesh import Mesh, audit, loft, merge, volume
+from vinemap.canopy.mesh import Mesh, audit, loft, merge, section_meshes, volume
+from vinemap.canopy.numbers import lengths_of
 from vinemap.compute import extras
 from vinemap.errors import DependencyError
 
@@ -66,6 +70,21 @@ def test_pieces_of_a_row_merge():
     empty = Mesh(*merge([]))
     assert (empty.vertices.shape, empty.faces.shape, volume(empty)) == ((0, 3), (0, 3), 0)
     assert empty.pieces == ()
+
+
+def test_meshes_reach_as_far_into_gaps_as_volumes_do():
+    """Half a step on the slope, and a lone section both ways; a row's ends are its ends."""
+    has = np.repeat([True, False, True, False, True], [3, 3, 1, 3, 2])
+    sections = many_sections([[[0.0, 0.0]]] * len(has)).subset(has, has)
+    sections = sections._replace(origin=sections.origin + 0.4 * sections.position[:, None] * [0, 0, 1])
+    table = pd.DataFrame({"row_id": sections.row_id, "position_m": sections.position})
+    rows = gpd.GeoDataFrame({"row_id": [1], "label": ["1"]}, geometry=[None])
+    (mesh,) = section_meshes(sections, np.tile(SQUARE, (has.sum(), 1, 1)), rows, step=0.25)
+    assert closed(mesh.vertices, mesh.faces)
+    assert volume(mesh) == pytest.approx(area(SQUARE) * lengths_of(table, 0.25).sum())
+    x, low = mesh.vertices[:, 0], mesh.vertices[:, 2] - 0.4 * mesh.vertices[:, 0]
+    assert sorted(set(x.round(3))) == [0, 0.25, 0.5, 0.625, 1.375, 1.5, 1.625, 2.375, 2.5, 2.75]
+    assert set(low.round(6)) == {0, 2}
 
 
 def test_open3d_finds_pieces_watertight_and_broken_ones_not():

@@ -200,7 +200,8 @@ def corners_of(canopy: Sections, polygons: Values) -> Floats:
 def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *, step: float) -> list[Mesh]:
     """Closed meshes of the rows' canopies: polygons of consecutive sections, joined (Eq. 20–22).
 
-    A mesh closes and starts anew where more than one section lacks.
+    A mesh closes and starts anew where more than one section lacks, half a step into what lies between: a section
+    stands for as much on either side, in volumes too.
 
     Parameters
     ----------
@@ -213,16 +214,32 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     step : float
         Metres between sections.
     """
-    corners = corners_of(canopy, polygons)
+    corners, half = corners_of(canopy, polygons), _ahead(canopy)[:, None] * step / 2
     parted = breaks(canopy.row_id, canopy.position, step)
-    runs = [run for run in np.split(np.arange(len(corners)), np.flatnonzero(parted) + 1) if len(run) > 1]
-    caps = _caps(corners[np.array([run[[0, -1]] for run in runs], dtype=np.int64).ravel()])
+    gap = np.concatenate([[False], parted & (np.diff(canopy.row_id) == 0), [False]])
+    runs = []
+    for run in np.split(np.arange(len(corners)), np.flatnonzero(parted) + 1):
+        before, after = (run[k : k + 1][gap[run[k : k + 1] + beyond]] for k, beyond in ((0, 0), (len(run) - 1, 1)))
+        piece = np.concatenate([corners[before] - half[before], corners[run], corners[after] + half[after]])
+        if len(piece) > 1:
+            runs.append((int(canopy.row_id[run[0]]), piece))
+    caps = _caps(np.array([piece[k] for _, piece in runs for k in (0, -1)]).reshape(-1, *corners.shape[1:]))
     pieces: dict[int, list[Any]] = {}
-    for run, first, last in zip(runs, caps[::2], caps[1::2], strict=True):
-        pieces.setdefault(int(canopy.row_id[run[0]]), []).append(loft(corners[run], (first, last)))
+    for (row_id, piece), first, last in zip(runs, caps[::2], caps[1::2], strict=True):
+        pieces.setdefault(row_id, []).append(loft(piece, (first, last)))
     numbers = rows.drop(columns="geometry").to_dict("records")
     return [
         Mesh(*merge(pieces[row["row_id"]]), row_id=int(row["row_id"]), label=str(row["label"]), extras=row)
         for row in numbers
         if row["row_id"] in pieces
     ]
+
+
+def _ahead(canopy: Sections) -> Floats:
+    """Where a metre along the row leads to from each section (m, 3), up or down the slope beside it."""
+    away = np.diff(canopy.position)
+    slope = np.diff(canopy.origin[:, 2]) / np.where(away > 0, away, np.inf)
+    last, before, after = np.ones(len(canopy.row_id), dtype=bool), *np.zeros((2, len(canopy.row_id)))
+    last[:-1], after[:-1] = np.diff(canopy.row_id) != 0, slope
+    before[1:] = np.where(last[:-1], 0.0, slope)
+    return np.column_stack([canopy.tangent, np.where(last, before, after)])
