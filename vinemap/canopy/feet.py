@@ -110,7 +110,7 @@ def _widest(canopy: Sections, near: tuple[Ints, Ints]) -> Values:
     bins, level = math.ceil(float(across.max()) / FOOT_BIN) + 1, np.floor(height / FOOT_BAND)
     out = np.zeros(len(canopy.row_id))
     for k in range(int(level.max()) + 1):
-        shown = _histograms(np.where(level == k, across, FOOT_BIN * (bins + 1)), canopy.start, 0.0, FOOT_BIN, bins + 1)
+        shown = _histograms(np.where(level == k, across, FOOT_BIN * (bins + 1)), canopy.start, bins + 1)
         shown = _pooled(shown[:, :-1], near)
         out = np.maximum(out, (_rank(shown, 1 - FOOT_RANKS[0]) - _rank(shown, FOOT_RANKS[0])) * FOOT_BIN)
     return out
