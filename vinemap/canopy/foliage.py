@@ -65,8 +65,8 @@ def separate_canopy(
     sections : Sections
         All points of every section of a row.
     margin : float
-        Metres above plane and terrain at which canopy begins, less where the row is low or its foliage goes on below,
-        more where weeds stand in it.
+        Metres above plane and terrain at which canopy begins, or less where the row is low, or more where weeds stand
+        in it.
     half_width : float, optional
         Metres to the side of γ at which canopy ends; by default what holds the row's, half its spacing at the most.
     high : float

@@ -58,10 +58,11 @@ def canopy_floor(
 ) -> float:
     """Metres above ground from which a row's points are its canopy's.
 
-    That is a margin, or in low rows where canopies are told from weeds by their height alone. It is lower as far as
-    their foliage goes on and next to nothing stands beside it that could be weeds or the soil's noise. It is higher
-    where weeds stand: in low rows where foliage has thinned out and something denser begins below; in others, whose
-    foliage may be thin above where it hides itself, where something stands on both sides of it that doesn't higher up.
+    That is a margin, or in low rows where canopies are told from weeds by their height alone. In these it is lower, as
+    far as their foliage goes on and next to nothing stands beside it that could be weeds or the soil's noise; or
+    higher, where foliage has thinned out and something denser begins below. In others, whose walls photographs draw
+    down to the ground, and whose foliage may be thin where it hides itself, it is only higher, where weeds stand:
+    something on both sides that doesn't stand there higher up.
 
     Parameters
     ----------
@@ -85,17 +86,17 @@ def canopy_floor(
     if not above.any():
         return floor
     upper = max(int(UPPER * top / BIN) - level - 1, 0)
-    lower = above[: upper + above[upper:].argmax() + 1]
-    usual, least = above.mean(), lower.min()
-    if top < LOWLY:
-        if inner * (inside[level] - RISE * least) > SURE * np.sqrt(inner * inside[level]):
-            return max(floor, (level + 1 + int((lower <= RISE * least).argmax())) * BIN)
-    else:
+    if top >= LOWLY:
         weeds = _weeds(left, height, strips[[0, 2, 3]], inside)[level : level + upper + 2]
         if weeds.any() and not weeds[-1]:
             highest = int(np.flatnonzero(weeds)[-1])
             free = above[highest : upper + 1]
             return max(floor, (level + highest + int((free <= RISE * free.min()).argmax()) + 1) * BIN)
+        return floor
+    lower = above[: upper + above[upper:].argmax() + 1]
+    usual, least = above.mean(), lower.min()
+    if inner * (inside[level] - RISE * least) > SURE * np.sqrt(inner * inside[level]):
+        return max(floor, (level + 1 + int((lower <= RISE * least).argmax())) * BIN)
     while level > 0 and SOLID * usual <= inside[level] <= RISE * least and beside[level] <= CLEAR * inside[level]:
         floor, least, level = min(floor, level * BIN), min(least, inside[level]), level - 1
     return floor
