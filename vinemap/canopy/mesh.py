@@ -219,9 +219,13 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
     gap = np.concatenate([[False], parted & (np.diff(canopy.row_id) == 0), [False]])
     runs = []
     for run in np.split(np.arange(len(corners)), np.flatnonzero(parted) + 1):
-        before, after = (run[k : k + 1][gap[run[k : k + 1] + beyond]] for k, beyond in ((0, 0), (len(run) - 1, 1)))
-        piece = np.concatenate([corners[before] - half[before], corners[run], corners[after] + half[after]])
-        if len(piece) > 1:
+        first, last = run[:1], run[-1:]
+        parts = [corners[run]]
+        if gap[first].any():
+            parts.insert(0, corners[first] - half[first])
+        if gap[last + 1].any():
+            parts.append(corners[last] + half[last])
+        if len(piece := np.concatenate(parts)) > 1:
             runs.append((int(canopy.row_id[run[0]]), piece))
     caps = _caps(np.array([piece[k] for _, piece in runs for k in (0, -1)]).reshape(-1, *corners.shape[1:]))
     pieces: dict[int, list[Any]] = {}
@@ -237,9 +241,9 @@ def section_meshes(canopy: Sections, polygons: Values, rows: gpd.GeoDataFrame, *
 
 def _ahead(canopy: Sections) -> Floats:
     """Where a metre along the row leads to from each section (m, 3), up or down the slope beside it."""
-    away = np.diff(canopy.position)
-    slope = np.diff(canopy.origin[:, 2]) / np.where(away > 0, away, np.inf)
-    last, before, after = np.ones(len(canopy.row_id), dtype=bool), *np.zeros((2, len(canopy.row_id)))
-    last[:-1], after[:-1] = np.diff(canopy.row_id) != 0, slope
-    before[1:] = np.where(last[:-1], 0.0, slope)
-    return np.column_stack([canopy.tangent, np.where(last, before, after)])
+    same, away = np.diff(canopy.row_id) == 0, np.diff(canopy.position)
+    slopes = (np.diff(canopy.origin[:, 2]) / np.where(away > 0, away, np.inf))[same]
+    slope = np.zeros(len(canopy.row_id))
+    slope[1:][same] = slopes
+    slope[:-1][same] = slopes  # but for the last one of a row
+    return np.column_stack([canopy.tangent, slope])
