@@ -190,15 +190,17 @@ def _held_against(
     remarks: list[str] = []
     if motion and wheels:
         check_times(motion, wheels.times, track)
-        remarks += [f"{wheels.left_out} lines of {motion} left out"] * (wheels.left_out > 0)
+        if wheels.left_out:
+            remarks.append(f"{wheels.left_out} lines of {motion} left out")
         remarks += _against_wheels(motion, wheels, track)
     if not (fixes and known):
         return bridged(track, odometer), tuple(remarks)
     check_times(fixes, known.times, track)
     track, far, fit = joined(track, known, odometer)
-    odd = known.left_out + far
-    remarks += [f"{odd} of {known.left_out + len(known.sd)} fixes left out"] * (odd > 0)
-    remarks += ["fixes contradict the track by more than both err"] * (not fit)
+    if odd := known.left_out + far:
+        remarks.append(f"{odd} of {known.left_out + len(known.sd)} fixes left out")
+    if not fit:
+        remarks.append("fixes contradict the track by more than both err")
     return track, tuple(remarks)
 
 
@@ -223,7 +225,7 @@ def _against_wheels(path: Path, wheels: Wheels, track: Sequence[TrackPoint]) -> 
     ratio = by_wheels / seen
     if not 1 / MOST_OFF < ratio < MOST_OFF:
         raise InputError(f"{path}: speeds make {ratio:.2g} of the way that frames show: is the unit the column's?")
-    return [f"wheels say {100 * (ratio - 1):+.0f}% of the way"] * (abs(ratio - 1) > TOLD_OFF)
+    return [f"wheels say {100 * (ratio - 1):+.0f}% of the way"] if abs(ratio - 1) > TOLD_OFF else []
 
 
 def _rows_of(path: Path) -> gpd.GeoDataFrame:
